@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A pinhole camera and the sensor noise of a structured-light depth camera."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+
+def _default_intrinsics() -> np.ndarray:
+    return np.array([[608.0, 0.0, 319.5], [0.0, 608.0, 239.5], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A posed pinhole camera; pixel (column u, row v) is centred on integer coordinates."""
+
+    T_world_camera: Float[np.ndarray, "4 4"]
+    intrinsics: Float[np.ndarray, "3 3"] = field(default_factory=_default_intrinsics)
+    width: int = 640
+    height: int = 480
+
+    @classmethod
+    def look_at(
+        cls, eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], **kwargs: object
+    ) -> "Camera":
+        """Return a camera at `eye` that looks at `target`, image rows level with the table."""
+        forward = np.asarray(target, dtype=np.float64) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = eye
+        return cls(pose, **kwargs)  # type: ignore[arg-type]
+
+    @classmethod
+    def orbit(
+        cls,
+        target: Float[np.ndarray, "3"],
+        distance: float,
+        azimuth: float,
+        elevation: float,
+        **kwargs: object,
+    ) -> "Camera":
+        """Return a camera at `distance` metres from `target`, angles in radians."""
+        offset = distance * np.array(
+            [
+                np.cos(elevation) * np.cos(azimuth),
+                np.cos(elevation) * np.sin(azimuth),
+                np.sin(elevation),
+            ]
+        )
+        return cls.look_at(np.asarray(target) + offset, np.asarray(target), **kwargs)
+
+    @property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Return the optical centre in the world, metres."""
+        return self.T_world_camera[:3, 3]
+
+    def ray_directions(self) -> Float[np.ndarray, "h w 3"]:
+        """Return world directions of all pixels, scaled so that t equals optical depth."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        pixels = np.stack([u, v, np.ones_like(u)], axis=-1).astype(np.float64)
+        return pixels @ np.linalg.inv(self.intrinsics).T @ self.T_world_camera[:3, :3].T
+
+    def window(self, center: np.ndarray, radius: float) -> tuple[slice, slice]:
+        """Return the (rows, columns) that a ball in front of the camera can cover.
+
+        Conservative: a ball that reaches the camera's plane covers the whole image.
+        """
+        local = (center - self.center) @ self.T_world_camera[:3, :3]
+        near = local[2] - radius
+        if near <= 1e-3:
+            return slice(0, self.height), slice(0, self.width)
+        slices = []
+        for axis, size in ((1, self.height), (0, self.width)):
+            f, c = self.intrinsics[axis, axis], self.intrinsics[axis, 2]
+            ends = [
+                f * (local[axis] + s * radius) / z + c
+                for s in (-1.0, 1.0)
+                for z in (near, local[2] + radius)
+            ]
+            low, high = int(np.floor(min(ends))), int(np.ceil(max(ends))) + 1
+            slices.append(slice(min(max(low, 0), size), max(min(high, size), 0)))
+        return slices[0], slices[1]
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """Noise of an active stereo camera at table range.
+
+    The standard deviation of depth grows with depth squared, since disparity is
+    measured with a constant error; neighbours share a part of it (the matching
+    window). Surfaces seen at grazing angles and pixels beside a depth step are lost
+    with some probability, or report a depth between the two sides ("flying").
+    """
+
+    sigma_at_1m: float = 0.0015  # metres
+    correlation_pixels: float = 2.0
+    correlated_share: float = 0.7  # of the variance
+    grazing_cosine: float = 0.15  # below it, pixels begin to vanish
+    edge_step: float = 0.02  # metres between neighbours that count as a depth step
+    edge_hole_probability: float = 0.25
+    flying_probability: float = 0.15
+    quantum: float = 0.001  # metres
+
+    def apply(
+        self,
+        depth: Float[np.ndarray, "h w"],
+        cosine: Float[np.ndarray, "h w"],
+        pixel_angle: float,
+        seed: int,
+    ) -> Float[np.ndarray, "h w"]:
+        """Return a noisy copy of a clean depth image (0 = no return stays 0).
+
+        Args:
+            depth: metres along the optical axis.
+            cosine: between the ray and the surface normal, per pixel.
+            pixel_angle: angle between neighbouring rays, radians.
+            seed: of this image; the same seed gives the same bits.
+        """
+        from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+        rng = np.random.default_rng([seed, 0x0D3B])
+        valid = depth > 0
+        white = rng.standard_normal(depth.shape)
+        smooth = gaussian_filter(rng.standard_normal(depth.shape), self.correlation_pixels)
+        smooth /= smooth.std()
+        unit = np.sqrt(self.correlated_share) * smooth + np.sqrt(1 - self.correlated_share) * white
+        noisy = depth + self.sigma_at_1m * depth**2 * unit
+        near = minimum_filter(np.where(valid, depth, np.inf), size=3)
+        far = maximum_filter(depth, size=3)
+        # A slanted surface also changes depth from pixel to pixel: that is no step.
+        slope = 2.0 * pixel_angle * depth / np.maximum(cosine, 1e-3)
+        edge = valid & (far - near > self.edge_step + slope)
+        draw = rng.random(depth.shape)
+        flying = edge & (draw < self.flying_probability)
+        mix = rng.random(depth.shape)
+        noisy[flying] = (mix * depth + (1 - mix) * np.where(depth - near > far - depth, near, far))[
+            flying
+        ]
+        lost = edge & (draw > 1 - self.edge_hole_probability)
+        lost |= cosine < self.grazing_cosine * rng.random(depth.shape)
+        noisy = np.round(noisy / self.quantum) * self.quantum
+        return np.where(valid & ~lost & (noisy > 0), noisy, 0.0)
