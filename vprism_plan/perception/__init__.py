@@ -1,0 +1,9 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One view in, labelled points with a known camera out."""
+
+from vprism_plan.perception.alignment import align_to_table
+from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.plane import Plane
+from vprism_plan.perception.plane_fitting import fit_plane
+
+__all__ = ["Observation", "Plane", "align_to_table", "fit_plane"]

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One view of the scene: depth, labels and a known camera."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int32
+
+from vprism_plan.errors import ObservationError
+from vprism_plan.perception import _validation
+from vprism_plan.perception.camera import point_image
+from vprism_plan.perception.plane import Plane
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """One segmented depth image with its camera, validated once, here.
+
+    Arrays, nested lists and torch tensors are accepted and copied, so a camera driver
+    that reuses its buffers cannot change an observation.
+
+    Attributes:
+        depth: (H, W) float32 or float64, metres along the optical axis, 0 = no return.
+        labels: (H, W) int32, 0 = background, positive = object id; None = not segmented.
+        intrinsics: (3, 3) float64 pinhole matrix, pixels, pixel centres at whole numbers.
+        T_world_camera: (4, 4) float64, maps camera to world coordinates; None = unposed,
+            and then the world frame *is* the camera frame.
+        color: (H, W, 3) uint8 RGB, or None.
+        plane: support plane in the world frame if it is known.
+
+    Raises:
+        ObservationError: what is wrong, what would be valid, and the remedy.
+    """
+
+    depth: Any
+    labels: Any
+    intrinsics: Any
+    T_world_camera: Any = None
+    color: Any = None
+    plane: Plane | None = None
+
+    def __post_init__(self) -> None:
+        depth = _validation.check_depth(self.depth)
+        checked: dict[str, Any] = {
+            "depth": depth,
+            "intrinsics": _validation.check_intrinsics(self.intrinsics, depth.shape),
+        }
+        if self.labels is not None:
+            checked["labels"] = _validation.check_labels(self.labels, depth.shape)
+        if self.T_world_camera is not None:
+            checked["T_world_camera"] = _validation.check_pose(self.T_world_camera)
+        if self.color is not None:
+            checked["color"] = _validation.check_color(self.color, depth.shape)
+        if self.plane is not None and not isinstance(self.plane, Plane):
+            raise ObservationError(
+                f"plane is a {type(self.plane).__name__}; it must be a Plane or None"
+            )
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(H, W) of the images, pixels."""
+        return int(self.depth.shape[0]), int(self.depth.shape[1])
+
+    @property
+    def posed(self) -> bool:
+        """Whether the camera's pose in the world is known."""
+        return self.T_world_camera is not None
+
+    @property
+    def pose(self) -> Float[np.ndarray, "4 4"]:
+        """Camera-to-world transform; the identity if unposed."""
+        return np.eye(4) if self.T_world_camera is None else self.T_world_camera.copy()
+
+    @property
+    def camera_center(self) -> Float[np.ndarray, " 3"]:
+        """Optical centre in the world frame, metres."""
+        return self.pose[:3, 3]
+
+    @cached_property
+    def object_ids(self) -> tuple[int, ...]:
+        """Sorted positive labels that occur on at least one pixel with a return."""
+        if self.labels is None:
+            return ()
+        ids = np.unique(self.labels[self.depth > 0])
+        return tuple(int(i) for i in ids if i > 0)
+
+    def require_objects(self) -> tuple[int, ...]:
+        """Return `object_ids`, or explain why there is nothing to map.
+
+        Raises:
+            ObservationError: unlabelled, all background, or labelled only where depth is 0.
+        """
+        if self.labels is None:
+            raise ObservationError(
+                "the observation has no labels; segment it first: segment_tabletop(obs)"
+            )
+        if not self.object_ids:
+            where = (
+                "every labelled pixel has no depth return (registered images?)"
+                if (self.labels > 0).any()
+                else "every label is 0 (background)"
+            )
+            raise ObservationError(
+                f"the observation shows no object: {where}; objects need positive labels, "
+                "or use segment_tabletop(obs)"
+            )
+        return self.object_ids
+
+    def point_image(self) -> Float[np.ndarray, "h w 3"]:
+        """World point (metres) behind every pixel, NaN where there is no return."""
+        return point_image(self.depth, self.intrinsics, self.pose)
+
+    def points(self) -> tuple[Float[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]:
+        """World points (metres) of the pixels with a return, row by row, and their labels.
+
+        Labels are all 0 if the observation is not segmented.
+        """
+        valid = self.depth > 0
+        points = self.point_image()[valid]
+        if self.labels is None:
+            return points, np.zeros(len(points), dtype=np.int32)
+        return points, self.labels[valid]
