@@ -2,8 +2,17 @@
 """One view in, labelled points with a known camera out."""
 
 from vprism_plan.perception.alignment import align_to_table
+from vprism_plan.perception.loading import load_observation
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane
+from vprism_plan.perception.saving import save_observation
 
-__all__ = ["Observation", "Plane", "align_to_table", "fit_plane"]
+__all__ = [
+    "Observation",
+    "Plane",
+    "align_to_table",
+    "fit_plane",
+    "load_observation",
+    "save_observation",
+]

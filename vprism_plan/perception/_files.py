@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Reading and writing images and JSON so that every failure is one clear line."""
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from vprism_plan.errors import ObservationError
+
+_DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+_LABEL_MODES = (*_DEPTH_MODES, "L", "P", "1")
+
+
+def _read_image(path: Path) -> tuple[np.ndarray, str]:
+    from PIL import Image
+
+    if not path.is_file():
+        raise ObservationError(f"{path} is missing")
+    try:
+        with Image.open(path) as image:
+            return np.array(image), image.mode
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise ObservationError(f"{path} is not a readable image: {error}") from error
+
+
+def read_depth_image(path: Path) -> np.ndarray:
+    """Return raw sensor units (H, W) of a 16-bit single-channel image."""
+    raw, mode = _read_image(path)
+    if mode not in _DEPTH_MODES:
+        raise ObservationError(
+            f"{path} has pixel format {mode}; depth must be a 16-bit single-channel PNG (an "
+            "8-bit image has lost the metric depth: export the raw one)"
+        )
+    return raw
+
+
+def read_label_image(path: Path) -> np.ndarray:
+    """Return integer ids (H, W) of a single-channel image, palette images by index."""
+    raw, mode = _read_image(path)
+    if mode not in _LABEL_MODES:
+        raise ObservationError(
+            f"{path} has pixel format {mode}; labels must be a single-channel 8- or 16-bit "
+            "PNG of object ids, 0 for background"
+        )
+    return raw.astype(np.int32)
+
+
+def read_color_image(path: Path) -> np.ndarray:
+    """Return (H, W, 3) uint8 RGB; grey images are repeated, alpha is dropped."""
+    raw, mode = _read_image(path)
+    if mode == "L":
+        return np.repeat(raw[..., None], 3, axis=2)
+    if mode not in ("RGB", "RGBA"):
+        raise ObservationError(f"{path} has pixel format {mode}; color must be an 8-bit RGB image")
+    return np.ascontiguousarray(raw[..., :3])
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file."""
+    if not path.is_file():
+        raise ObservationError(f"{path} is missing")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ObservationError(f"{path} is not readable JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise ObservationError(f"{path} holds a {type(content).__name__}; it must be an object")
+    return content
+
+
+def number(content: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
+    """Return a finite number from a JSON object, or name what is missing."""
+    if key not in content and default is not None:
+        return default
+    value = content.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        found = "is missing" if key not in content else f"is {value!r}"
+        raise ObservationError(f"{path}: {key!r} {found}; it must be a finite number")
+    return float(value)
+
+
+def positive_number(
+    content: dict[str, Any], key: str, path: Path, default: float | None = None
+) -> float:
+    """Return a finite number above 0 from a JSON object."""
+    value = number(content, key, path, default)
+    if value <= 0:
+        raise ObservationError(f"{path}: {key!r} is {value:g}; it must be positive")
+    return value
+
+
+def matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """Return a float64 array of the given shape from a flat or nested JSON list."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ObservationError(f"{what} is not a matrix of numbers: {error}") from error
+    if array.size != int(np.prod(shape)):
+        raise ObservationError(
+            f"{what} has {array.size} numbers; it must have {int(np.prod(shape))} ({shape})"
+        )
+    return array.reshape(shape)
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write through a temporary file beside `path`, so no half-written file ever remains."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            write(stream)
+        # mkstemp makes files private; give them what open() would have given.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
