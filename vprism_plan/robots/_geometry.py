@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Collision shapes of links: boxes, cylinders and spheres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class PrimitiveGeometry:
+    """One solid of a link.
+
+    Attributes:
+        kind: ``"box"``, ``"cylinder"`` (axis z, centred) or ``"sphere"``.
+        size: Metres. Box: the three edge lengths; cylinder: radius and length;
+            sphere: radius.
+        T_link: Pose of the solid in its link's frame, (4, 4).
+    """
+
+    kind: Literal["box", "cylinder", "sphere"]
+    size: tuple[float, ...]
+    T_link: Float[np.ndarray, "4 4"]
+
+    def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Exact signed distance of points to the solid.
+
+        Args:
+            points: (n, 3) positions in the link's frame, metres.
+
+        Returns:
+            (n,) metres, negative inside.
+        """
+        local = (points - self.T_link[:3, 3]) @ self.T_link[:3, :3]
+        if self.kind == "sphere":
+            return np.linalg.norm(local, axis=1) - self.size[0]
+        if self.kind == "box":
+            excess = np.abs(local) - 0.5 * np.asarray(self.size)
+        else:
+            radius, length = self.size
+            radial = np.linalg.norm(local[:, :2], axis=1) - radius
+            excess = np.stack([radial, np.abs(local[:, 2]) - 0.5 * length], axis=1)
+        outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
+        return outside + np.minimum(excess.max(axis=1), 0.0)
+
+    def bounding_radius(self) -> float:
+        """Radius in metres of the ball around the solid's centre that holds it."""
+        if self.kind == "sphere":
+            return self.size[0]
+        if self.kind == "box":
+            return float(0.5 * np.linalg.norm(self.size))
+        return float(np.hypot(self.size[0], 0.5 * self.size[1]))

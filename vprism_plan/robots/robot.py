@@ -1,0 +1,354 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot arm as spheres that follow a configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from vprism_plan.errors import RobotError
+from vprism_plan.robots import _frames, _self_collision
+from vprism_plan.robots._arrays import KinematicArrays
+from vprism_plan.robots._geometry import PrimitiveGeometry
+from vprism_plan.robots._model import RobotModel, load_model
+from vprism_plan.robots._spheres import link_spheres
+from vprism_plan.robots._srdf import SemanticModel, load_srdf
+from vprism_plan.robots._torch_kinematics import TorchKinematics
+
+if TYPE_CHECKING:
+    import torch
+
+READY = "ready"
+ARM_GROUP = "arm"
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A robot read from a URDF; build it with :meth:`from_urdf`.
+
+    A configuration ``q`` has one value per name in ``joint_names``: radians for
+    revolute and continuous joints, metres for prismatic ones.
+
+    Attributes:
+        name: The robot's name.
+        joint_names: The joints of a configuration, in its order.
+        locked: Value of every other actuated joint.
+        velocity_limits: (dof,) rad/s or m/s; inf where the URDF states none.
+        base_pose: (4, 4) pose of the root link in the world.
+        link_names: The links that carry collision spheres.
+        geometry: Link name -> its primitive solids (links without any are absent).
+        named_states: SRDF states that fix every joint of ``joint_names``.
+        disabled_pairs: Unordered link pair -> the SRDF's reason for not testing it.
+        arrays: The flat form that compiled kernels read.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    locked: dict[str, float]
+    velocity_limits: Float[np.ndarray, "dof"]
+    base_pose: Float[np.ndarray, "4 4"]
+    link_names: tuple[str, ...]
+    geometry: dict[str, tuple[PrimitiveGeometry, ...]]
+    named_states: dict[str, np.ndarray]
+    disabled_pairs: dict[frozenset[str], str]
+    arrays: KinematicArrays
+    _links: dict[str, _frames.Attachment] = field(repr=False)
+    _torch: TorchKinematics = field(repr=False)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | Path,
+        srdf: str | Path | None = None,
+        spheres: str | Path | Mapping[str, Any] | None = None,
+        base_pose: ArrayLike | None = None,
+        joints: Sequence[str] | None = None,
+        locked: Mapping[str, float] | None = None,
+    ) -> Robot:
+        """Read a robot.
+
+        Args:
+            path: The URDF (xacro expanded).
+            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is
+                one. Without an SRDF, only links joined by a joint and links whose
+                spheres always overlap are left out of self-collision.
+            spheres: Collision spheres: a YAML file (``collision_spheres: {link:
+                [{center: [x, y, z], radius: r}]}``), such a mapping, or None:
+                ``<stem>_spheres.yml`` beside the URDF, else spheres that enclose
+                the URDF's own boxes, cylinders and spheres.
+            base_pose: (4, 4) pose of the root link in the world; None is identity.
+            joints: Joints of a configuration, in the order wanted. None takes the
+                SRDF group "arm" if there is one, else all joints that move and do
+                not mimic another.
+            locked: Values for joints not in ``joints``. Default for each: its value
+                in the SRDF (state "ready" first, then file order), else 0 or the
+                limit next to it.
+
+        Raises:
+            RobotError: Something above is malformed or does not fit together; the
+                message names it.
+        """
+        path = Path(path)
+        model = load_model(path)
+        beside = path.with_suffix(".srdf")
+        srdf = beside if srdf is None and beside.is_file() else srdf
+        semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
+        active = _choose_joints(model, semantics, joints)
+        fixed_values = _lock(model, semantics, active, locked or {})
+        base = _rigid(np.eye(4) if base_pose is None else base_pose)
+        balls = link_spheres(model, path, spheres)
+        nothing = np.empty((0, 2), dtype=np.int64)
+        arrays, links = _frames.build_arrays(model, active, fixed_values, balls, nothing, base)
+        pairs = _self_collision.candidate_pairs(model, links, tuple(balls), semantics.disabled)
+        if srdf is None:
+            pairs = _self_collision.drop_always_touching(arrays, pairs, tuple(balls))
+        arrays = dataclasses.replace(arrays, pairs=pairs)
+        states = {
+            name: np.array([values[joint] for joint in active])
+            for name, values in semantics.merged_states().items()
+            if all(joint in values for joint in active)
+        }
+        return cls(
+            name=model.name,
+            joint_names=active,
+            locked=fixed_values,
+            velocity_limits=np.array([model.joint_map[j].velocity for j in active]),
+            base_pose=base,
+            link_names=tuple(balls),
+            geometry={n: link.primitives for n, link in model.links.items() if link.primitives},
+            named_states=states,
+            disabled_pairs=dict(semantics.disabled),
+            arrays=arrays,
+            _links=links,
+            _torch=TorchKinematics(arrays),
+        )
+
+    @property
+    def dof(self) -> int:
+        """Number of joints in a configuration."""
+        return len(self.joint_names)
+
+    @property
+    def lower(self) -> Float[np.ndarray, "dof"]:
+        """Lower joint limits; -pi for continuous joints, which have none."""
+        return self.arrays.lower
+
+    @property
+    def upper(self) -> Float[np.ndarray, "dof"]:
+        """Upper joint limits; +pi for continuous joints, which have none."""
+        return self.arrays.upper
+
+    @property
+    def continuous(self) -> Bool[np.ndarray, "dof"]:
+        """True for joints that turn without limit."""
+        return self.arrays.continuous
+
+    @property
+    def sphere_radii(self) -> Float[np.ndarray, "spheres"]:
+        """Radius of each collision sphere, metres."""
+        return self.arrays.sphere_radius
+
+    @property
+    def sphere_links(self) -> Int[np.ndarray, "spheres"]:
+        """Index into ``link_names`` of each collision sphere's link."""
+        return self.arrays.sphere_link
+
+    @property
+    def collision_pairs(self) -> Int[np.ndarray, "pairs 2"]:
+        """Link pairs to test for self-collision, indices into ``link_names``."""
+        return self.arrays.pairs
+
+    @property
+    def fixed_links(self) -> Bool[np.ndarray, "links"]:
+        """True for links of ``link_names`` that no joint moves (the mounted base)."""
+        return self.arrays.link_fixed
+
+    @property
+    def neutral(self) -> Float[np.ndarray, "dof"]:
+        """The SRDF state "ready" if there is one, else 0 or the limit next to it."""
+        if READY in self.named_states:
+            return self.named_states[READY].copy()
+        return np.clip(np.zeros(self.dof), self.lower, self.upper)
+
+    @functools.cached_property
+    def reach(self) -> float:
+        """Upper bound on how far any sphere gets from the root link's origin, metres."""
+        return _frames.reach_bound(self.arrays)
+
+    def sphere_centers(
+        self, q: Float[torch.Tensor, "*batch dof"]
+    ) -> Float[torch.Tensor, "*batch spheres 3"]:
+        """World centres of the collision spheres.
+
+        Args:
+            q: Configurations, float32 or float64, any device and batch shape.
+
+        Returns:
+            Centres in metres, same dtype and device, differentiable in q (any order).
+
+        Raises:
+            RobotError: q has another dtype, a wrong last dimension, or values that
+                are not finite.
+        """
+        import torch
+
+        if q.ndim == 0 or q.shape[-1] != self.dof:
+            raise RobotError(f"q has shape {tuple(q.shape)}; expected {self._expected('(..., ')}")
+        if not bool(torch.isfinite(q.detach()).all()):
+            raise RobotError("q holds NaN or infinite values; give finite joint values")
+        local = self._torch.sphere_centers(q.reshape(-1, self.dof))
+        base = torch.as_tensor(self.base_pose, dtype=q.dtype, device=q.device)
+        world = local @ base[:3, :3].T + base[:3, 3]
+        return world.reshape(*q.shape[:-1], *world.shape[1:])
+
+    def link_poses(self, q: ArrayLike) -> dict[str, np.ndarray]:
+        """World poses of all links of the URDF.
+
+        Args:
+            q: (dof,) configuration.
+
+        Returns:
+            Link name -> (4, 4).
+        """
+        R, t = _frames.frame_poses(self.arrays, self.check_configuration(q)[None])
+        poses = {}
+        for link, sits in self._links.items():
+            frame = np.eye(4)
+            frame[:3, :3], frame[:3, 3] = R[0, sits.frame], t[0, sits.frame]
+            poses[link] = frame @ sits.T
+        return poses
+
+    def random_configuration(self, rng: np.random.Generator) -> Float[np.ndarray, "dof"]:
+        """A uniform configuration within the limits."""
+        return rng.uniform(self.lower, self.upper)
+
+    def check_configuration(self, q: Any) -> Float[np.ndarray, "dof"]:
+        """A configuration as a float64 array.
+
+        Joint limits are not looked at: being outside is a verdict, not an error.
+
+        Raises:
+            RobotError: The length is wrong or a value is not a finite number.
+        """
+        try:
+            array = np.array(q, dtype=np.float64, order="C")
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise RobotError(
+                f"a configuration of {self.name} cannot be read from {type(q).__name__}: {error}; "
+                f"expected {self._expected('(')}"
+            ) from error
+        if array.shape != (self.dof,):
+            raise RobotError(
+                f"a configuration of {self.name} has shape {array.shape}; "
+                f"expected {self._expected('(')}"
+            )
+        if not np.isfinite(array).all():
+            bad = {
+                name: float(v)
+                for name, v in zip(self.joint_names, array, strict=True)
+                if not math.isfinite(v)
+            }
+            raise RobotError(f"joint values are not finite: {bad}; give finite numbers")
+        return array
+
+    def with_base_pose(self, base_pose: ArrayLike) -> Robot:
+        """The same robot standing elsewhere; shares everything but the base.
+
+        Args:
+            base_pose: (4, 4) pose of the root link in the world.
+
+        Raises:
+            RobotError: The pose is not a rigid motion.
+        """
+        base = _rigid(base_pose)
+        arrays = dataclasses.replace(
+            self.arrays,
+            base_R=np.ascontiguousarray(base[:3, :3]),
+            base_t=np.ascontiguousarray(base[:3, 3]),
+        )
+        return dataclasses.replace(self, base_pose=base, arrays=arrays)
+
+    def _expected(self, opening: str) -> str:
+        return f"{opening}{self.dof},) for the joints {list(self.joint_names)}"
+
+
+def _choose_joints(
+    model: RobotModel, semantics: SemanticModel, joints: Sequence[str] | None
+) -> tuple[str, ...]:
+    valid = model.actuated
+    if joints is None:
+        group = [name for name in semantics.groups.get(ARM_GROUP, ()) if name in valid]
+        chosen = tuple(group) or valid
+    elif isinstance(joints, str):
+        raise RobotError(f"joints is the string {joints!r}; give a sequence of joint names")
+    else:
+        chosen = tuple(joints)
+    unknown = [name for name in chosen if name not in valid]
+    if unknown:
+        raise RobotError(f"unknown or non-actuated joints {unknown}; valid: {list(valid)}")
+    if len(set(chosen)) != len(chosen):
+        raise RobotError(f"joints {list(chosen)} names a joint twice")
+    if not chosen:
+        raise RobotError(f"no joint of '{model.name}' moves; a robot needs at least one")
+    return chosen
+
+
+def _lock(
+    model: RobotModel,
+    semantics: SemanticModel,
+    active: Sequence[str],
+    given: Mapping[str, float],
+) -> dict[str, float]:
+    """The value of every actuated joint that is not in the configuration."""
+    rest = [name for name in model.actuated if name not in active]
+    unknown = sorted(set(given) - set(rest))
+    if unknown:
+        raise RobotError(f"locked names {unknown}; joints that can be locked here: {rest}")
+    values = {}
+    for name in rest:
+        joint = model.joint_map[name]
+        stated = semantics.state_value(name)
+        if name in given:
+            value = float(given[name])
+        elif stated is not None:
+            value = stated
+        else:
+            value = min(max(0.0, joint.lower), joint.upper)
+        within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
+        if not (math.isfinite(value) and within):
+            raise RobotError(
+                f"joint '{name}' is locked at {value}; its limits are "
+                f"[{joint.lower:.6g}, {joint.upper:.6g}]"
+            )
+        values[name] = value
+    return values
+
+
+def _rigid(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    """A copy of a pose, refused unless it is a proper rigid motion."""
+    try:
+        T = np.array(pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RobotError(f"base_pose is not a (4, 4) array: {error}") from error
+    if T.shape != (4, 4):
+        raise RobotError(f"base_pose has shape {T.shape}; expected (4, 4)")
+    if not np.isfinite(T).all():
+        raise RobotError("base_pose holds NaN or infinite values; give a rigid 4x4 pose")
+    R = T[:3, :3]
+    drift = float(np.abs(R @ R.T - np.eye(3)).max())
+    if drift > 1e-6 or np.linalg.det(R) < 0 or not np.array_equal(T[3], [0, 0, 0, 1]):
+        raise RobotError(
+            f"base_pose is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
+            f"determinant {np.linalg.det(R):.6g} (expected 1) and last row {T[3].tolist()} "
+            "(expected [0, 0, 0, 1])"
+        )
+    return T
