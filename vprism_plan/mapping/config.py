@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Every number the map depends on, in one frozen and validated place."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Self
+
+from vprism_plan.errors import ConfigError
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+_POSITIVE = ("a finite number above 0", lambda v: _finite(v) and v > 0)
+_NON_NEGATIVE = ("a finite number of at least 0", lambda v: _finite(v) and v >= 0)
+_PROBABILITY = ("strictly between 0 and 1", lambda v: _finite(v) and 0 < v < 1)
+
+
+def _whole(minimum: int) -> tuple[str, Callable[[object], bool]]:
+    return (
+        f"a whole number of at least {minimum}",
+        lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= minimum,
+    )
+
+
+_RULES: dict[str, tuple[str, Callable]] = {
+    "gamma": _POSITIVE,
+    "kernel_cutoff": _PROBABILITY,
+    "hinge_spacing": _POSITIVE,
+    "hinge_radius": _POSITIVE,
+    "hinge_margin": _NON_NEGATIVE,
+    "hinge_depth": _NON_NEGATIVE,
+    "surface_hinges": _whole(0),
+    "iterations": _whole(1),
+    "variational_updates": _whole(1),
+    "tolerance": _NON_NEGATIVE,
+    "prior_logit_variance": _POSITIVE,
+    "prior_weight_variance": _POSITIVE,
+    "bias_variance": _POSITIVE,
+    "prior_occupancy": _PROBABILITY,
+    "object_radius": _POSITIVE,
+    "ray_step": _POSITIVE,
+    "below_plane_samples": _whole(0),
+    "below_plane_margin": _NON_NEGATIVE,
+    "object_resolution": _POSITIVE,
+    "empty_resolution": _POSITIVE,
+    "front_distance": _POSITIVE,
+    "front_resolution": _POSITIVE,
+    "max_points": _whole(1),
+    "max_hinges": _whole(1),
+}
+_OPTIONAL = frozenset(
+    {"hinge_depth", "prior_logit_variance", "prior_weight_variance", "prior_occupancy"}
+    | {"front_distance"}
+)
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Parameters of a V-PRISM map; `MapConfig.paper()` is Table III of the paper.
+
+    The default is calibrated for planning on generated scenes with known geometry
+    (`docs/decisions.md` has the numbers): finer hinges, a prior stated as a logit
+    variance, negatives just in front of each observed surface, and an empty prior
+    that reads the same whatever the number of objects. Lengths are in metres.
+
+    Kernel
+        gamma: Gaussian kernel exp(-gamma r^2), 1/m^2; length 1/sqrt(2 gamma).
+        kernel_cutoff: kernel values below this are exactly 0.
+    Hinge points
+        hinge_spacing: edge of the lattice cell, m. Up to 1.3 kernel lengths the
+            lattice leaves next to no trace in the variance; above, it shows.
+        hinge_shift: offset of the lattice from multiples of the spacing, m.
+        hinge_radius: lattice nodes are kept this near an object's box centre, m ...
+        hinge_margin: ... or this near its axis-aligned box, m.
+        hinge_depth: nodes deeper than this under the plane are dropped, m; None keeps all.
+        surface_hinges: random surface points taken as hinges, per object.
+        max_hinges: refuse to build more (memory and time grow with the cube).
+    Learning
+        iterations: EM iterations at most.
+        variational_updates: alternations of alpha and xi per iteration (the paper: 1).
+            They cost no matrix work and only ever raise the bound.
+        tolerance: stop when the bound rises by less than this share of itself.
+        prior_logit_variance: prior variance v of one class's logit, averaged over a
+            lattice cell. The weights get v / S, S = (pi / (2 gamma))^(3/2) / spacing^3,
+            the mean over a cell of the sum of squared features, so that the prior
+            means the same at every spacing.
+        prior_weight_variance: the same stated on the weights (the paper). Exactly one
+            of the two is set.
+        bias_variance: prior variance of the bias weight. The bias is all that acts
+            where no hinge reaches; left free, it learns the mix of the training points
+            and then claims to know unseen space. The default pins it to its prior mean.
+        prior_occupancy: P(occupied) of a flat posterior, both inside the lattice and
+            out of its reach, whatever the number of objects; None leaves the prior
+            means at 0, where P(occupied) = 1 - 1/K.
+    Negative samples
+        object_radius: r_obj, m; negatives are kept this near an object's box centre.
+        ray_step: length of a stratum along a camera ray, m; one sample in each.
+        below_plane_samples: samples in the ball of r_obj around each box centre, of
+            which those under the plane are kept.
+        below_plane_margin: "under" means at least this far below the plane, m.
+        object_resolution, empty_resolution: grid subsampling per label, m.
+        front_distance: extra negatives this far in front of each observed object
+            point, m; None for none (the paper).
+        front_resolution: grid that thins those, m.
+        max_points: empty points above this total are dropped at random.
+    """
+
+    gamma: float = 1000.0
+    kernel_cutoff: float = 1e-5
+    hinge_spacing: float = 0.04
+    hinge_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    hinge_radius: float = 0.12
+    hinge_margin: float = 0.08
+    hinge_depth: float | None = 0.05
+    surface_hinges: int = 48
+    max_hinges: int = 6000
+    iterations: int = 6
+    variational_updates: int = 3
+    tolerance: float = 1e-5
+    prior_logit_variance: float | None = 50.0
+    prior_weight_variance: float | None = None
+    bias_variance: float = 1e-8
+    prior_occupancy: float | None = 0.3
+    object_radius: float = 0.25
+    ray_step: float = 0.1
+    below_plane_samples: int = 4000
+    below_plane_margin: float = 0.0
+    object_resolution: float = 0.01
+    empty_resolution: float = 0.015
+    front_distance: float | None = 0.005
+    front_resolution: float = 0.01
+    max_points: int = 150_000
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in _RULES or (value is None and field.name in _OPTIONAL):
+                continue
+            valid, holds = _RULES[field.name]
+            if not holds(value):
+                raise ConfigError(f"MapConfig.{field.name} is {value!r}; it must be {valid}")
+        shift = tuple(self.hinge_shift)
+        if len(shift) != 3 or not all(_finite(s) for s in shift):
+            raise ConfigError(
+                f"MapConfig.hinge_shift is {self.hinge_shift!r}; it must be three lengths (m)"
+            )
+        object.__setattr__(self, "hinge_shift", tuple(float(s) for s in shift))
+        if (self.prior_logit_variance is None) == (self.prior_weight_variance is None):
+            raise ConfigError(
+                "MapConfig takes exactly one of prior_logit_variance "
+                f"({self.prior_logit_variance!r}) and prior_weight_variance "
+                f"({self.prior_weight_variance!r}); set the other to None"
+            )
+
+    @classmethod
+    def paper(cls) -> Self:
+        """Return the paper's Table III; what it leaves open is as in the published code.
+
+        Left open by the paper: prior variance (1e4 on every weight, the bias
+        included), the hinges' extent (0.15 m around each box centre), the stratum
+        (0.1 m). Prior means are 0, so a flat posterior says P(occupied) = 1 - 1/K.
+        """
+        return cls(
+            gamma=1000.0,
+            hinge_spacing=0.05,
+            hinge_radius=0.15,
+            hinge_margin=0.0,
+            hinge_depth=None,
+            surface_hinges=32,
+            iterations=3,
+            variational_updates=1,
+            tolerance=0.0,
+            prior_logit_variance=None,
+            prior_weight_variance=1e4,
+            bias_variance=1e4,
+            prior_occupancy=None,
+            object_radius=0.25,
+            ray_step=0.1,
+            object_resolution=0.01,
+            empty_resolution=0.015,
+            front_distance=None,
+        )
+
+    @property
+    def kernel_length(self) -> float:
+        """Length scale of the kernel, m: 1 / sqrt(2 gamma)."""
+        return 1.0 / math.sqrt(2.0 * self.gamma)
+
+    @property
+    def cutoff_radius(self) -> float:
+        """Distance beyond which a feature is exactly 0, m."""
+        return math.sqrt(-math.log(self.kernel_cutoff) / self.gamma)
+
+    @property
+    def mean_squared_feature_sum(self) -> float:
+        """Mean over a lattice cell of the sum of squared features (see the class)."""
+        return (math.pi / (2.0 * self.gamma)) ** 1.5 / self.hinge_spacing**3
+
+    @property
+    def mean_feature_sum(self) -> float:
+        """Mean over a lattice cell of the sum of features."""
+        return (math.pi / self.gamma) ** 1.5 / self.hinge_spacing**3
+
+    @property
+    def weight_variance(self) -> float:
+        """Prior variance of a hinge weight, from whichever way it was stated."""
+        if self.prior_weight_variance is not None:
+            return self.prior_weight_variance
+        assert self.prior_logit_variance is not None
+        return self.prior_logit_variance / self.mean_squared_feature_sum
+
+    @property
+    def logit_variance(self) -> float:
+        """Prior variance of a logit inside the lattice, from whichever way it was stated."""
+        if self.prior_logit_variance is not None:
+            return self.prior_logit_variance
+        return self.weight_variance * self.mean_squared_feature_sum

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Softmax EM with Bouchard's bound (section IV, algorithm 1), sparse and in float64.
+
+Per iteration the cost is N n^2 K / 2 multiply-adds for the Gram blocks and as many for
+the quadratic forms (N points, n active hinges per point, K classes), plus one Cholesky
+factor and the inverse's envelope per class. Memory: two envelopes of E x K numbers
+(E <= M (M + 1) / 2) and one dense matrix.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan._kernels import mapping as kernels
+from vprism_plan._threads import run_chunked, worker_count
+from vprism_plan.errors import MapError
+from vprism_plan.mapping.factors import invert_class
+from vprism_plan.mapping.features import BlockFeatures, FeatureSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Gaussian prior of every class's weights.
+
+    Attributes:
+        mean: (M, K).
+        precision: (E, K) envelope.
+        log_determinant: (K,) of the precision.
+    """
+
+    mean: Float[np.ndarray, "m k"]
+    precision: Float[np.ndarray, "e k"]
+    log_determinant: Float[np.ndarray, " k"]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Gaussian posterior of the weights, and the evidence bound after every iteration."""
+
+    mean: Float[np.ndarray, "m k"]
+    covariance: Float[np.ndarray, "e k"]
+    precision: Float[np.ndarray, "e k"]
+    log_determinant: Float[np.ndarray, " k"]
+    history: tuple[float, ...]
+
+
+def diagonal_prior(
+    space: FeatureSpace, mean: Float[np.ndarray, "m k"], variance: Float[np.ndarray, " m"]
+) -> Prior:
+    """Return independent weights with the given means, and variances shared by the classes."""
+    classes = mean.shape[1]
+    precision = np.zeros((space.envelope_size, classes))
+    precision[space.diagonal] = (1.0 / variance)[:, None]
+    return Prior(mean, precision, np.full(classes, -np.log(variance).sum()))
+
+
+def bouchard_lambda(xi: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """lambda(xi) = (sigmoid(xi) - 1/2) / (2 xi), with its limit 1/8 at 0."""
+    small = np.abs(xi) < 1e-3
+    safe = np.where(small, 1.0, xi)
+    # sigmoid(x) - 1/2 = tanh(x / 2) / 2 loses no digits near 0; below, three terms of the series.
+    return np.where(small, 0.125 - xi**2 / 96.0 + xi**4 / 960.0, np.tanh(0.5 * safe) / (4.0 * safe))
+
+
+def update_alpha(
+    mean: Float[np.ndarray, "n k"], weight: Float[np.ndarray, "n k"]
+) -> Float[np.ndarray, " n"]:
+    """Equation for alpha_i, as printed: a sum in the numerator; `weight` is lambda(xi)."""
+    classes = mean.shape[1]
+    return (0.5 * (0.5 * classes - 1.0) + (weight * mean).sum(axis=1)) / weight.sum(axis=1)
+
+
+def update_xi(
+    mean: Float[np.ndarray, "n k"],
+    variance: Float[np.ndarray, "n k"],
+    alpha: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n k"]:
+    """Equation for xi_ik: the root of E[(z_ik - alpha_i)^2]."""
+    return np.sqrt(variance + (mean - alpha[:, None]) ** 2)
+
+
+def expected_bound(
+    mean: Float[np.ndarray, "n k"],
+    variance: Float[np.ndarray, "n k"],
+    alpha: Float[np.ndarray, " n"],
+    xi: Float[np.ndarray, "n k"],
+    labels: Int[np.ndarray, " n"],
+) -> float:
+    """Sum over points of E_W[ln Q(y_i | x_i, W; alpha, xi)] (theorem 1)."""
+    centred = mean - alpha[:, None]
+    square = variance + centred**2
+    terms = 0.5 * (centred - xi) + bouchard_lambda(xi) * (square - xi**2) + np.logaddexp(0.0, xi)
+    own = mean[np.arange(len(labels)), labels]
+    return float((own - alpha - terms.sum(axis=1)).sum())
+
+
+def divergence(space: FeatureSpace, posterior: Posterior, prior: Prior) -> float:
+    """Sum over classes of the Kullback-Leibler divergence of the posterior from the prior."""
+    classes = prior.mean.shape[1]
+    trace = np.empty(classes)
+    kernels.envelope_inner(
+        prior.precision, posterior.covariance, space.row_first, space.base, trace
+    )
+    difference = posterior.mean - prior.mean
+    product = np.empty_like(difference)
+    kernels.envelope_product(prior.precision, space.row_first, space.base, difference, product)
+    quadratic = (difference * product).sum(axis=0)
+    gap = posterior.log_determinant - prior.log_determinant
+    return float(0.5 * (trace + quadratic - space.size + gap).sum())
+
+
+def _row_pieces(space: FeatureSpace, features: BlockFeatures) -> list[tuple[int, int]]:
+    """Split the envelope rows into pieces of about equal work, for threads."""
+    work = np.bincount(features.near, minlength=space.size).astype(float)
+    work[:-1] *= np.maximum(1.0, np.arange(space.size - 1) - space.row_first[:-1])
+    pieces = 1 if worker_count() == 1 else 4 * worker_count()
+    cumulative = np.cumsum(work)
+    cuts = np.searchsorted(cumulative, cumulative[-1] * np.arange(1, pieces) / pieces)
+    edges = np.unique(np.concatenate(([0], cuts, [space.size])))
+    return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
+
+
+def _accumulate(
+    space: FeatureSpace,
+    features: BlockFeatures,
+    weight: Float[np.ndarray, "n k"],
+    out: Float[np.ndarray, "e k"],
+) -> None:
+    """Add sum_i weight_ik phi_i phi_i^T to `out`."""
+    pieces = _row_pieces(space, features)
+
+    def rows(chunk: slice) -> None:
+        for lo, hi in pieces[chunk]:
+            kernels.gram_rows(*features.arguments, weight, space.row_first, space.base, lo, hi, out)
+
+    run_chunked(rows, len(pieces), 1)
+
+
+def logit_moments(
+    space: FeatureSpace,
+    features: BlockFeatures,
+    mean: Float[np.ndarray, "m k"],
+    covariance: Float[np.ndarray, "e k"],
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+    """Return mean and variance of every training point's logits, in block order."""
+    n, classes = len(features.order), mean.shape[1]
+    m, v = np.empty((n, classes)), np.empty((n, classes))
+    block_start, near_start, phi_start, near, phi = features.arguments
+
+    def blocks(chunk: slice) -> None:
+        kernels.stored_moments(
+            block_start, chunk.start, chunk.stop, near_start, phi_start, near, phi,
+            mean, covariance, space.row_first, space.base, m, v,
+        )  # fmt: skip
+
+    run_chunked(blocks, len(block_start) - 1, 64)
+    return m, v
+
+
+def fit_weights(
+    space: FeatureSpace,
+    features: BlockFeatures,
+    labels: Int[np.ndarray, " n"],
+    prior: Prior,
+    *,
+    iterations: int,
+    variational_updates: int = 1,
+    tolerance: float = 0.0,
+) -> Posterior:
+    """Run EM from xi = 1, alpha = 0 and return the posterior of all classes.
+
+    `labels` (class per point, 0 is empty) follow the points as given, not the blocks.
+    Stops after `iterations`, or when the bound rises by less than `tolerance` of itself.
+
+    Raises:
+        MapError: a label is not a class, or a precision matrix cannot be factorised.
+    """
+    classes = prior.mean.shape[1]
+    labels = np.asarray(labels)[features.order]
+    if len(labels) == 0 or labels.min() < 0 or labels.max() >= classes:
+        raise MapError(f"labels must be classes 0..{classes - 1}, with at least one point")
+    one_hot = np.zeros((len(labels), classes))
+    one_hot[np.arange(len(labels)), labels] = 1.0
+    prior_information = np.empty_like(prior.mean)
+    kernels.envelope_product(
+        prior.precision, space.row_first, space.base, prior.mean, prior_information
+    )
+    weight = bouchard_lambda(np.ones((len(labels), classes)))
+    alpha = np.zeros(len(labels))
+    mean, covariance = np.empty_like(prior.mean), np.empty_like(prior.precision)
+    history: list[float] = []
+    posterior: Posterior | None = None
+    for _ in range(iterations):
+        precision = prior.precision.copy()
+        _accumulate(space, features, 2.0 * weight, precision)
+        information = prior_information.copy()
+        linear = one_hot - 0.5 + 2.0 * alpha[:, None] * weight
+        kernels.feature_sums(*features.arguments, linear, information)
+        log_determinant = np.array(
+            [
+                invert_class(space, precision, information, k, mean, covariance)
+                for k in range(classes)
+            ]
+        )
+        posterior = Posterior(mean, covariance, precision, log_determinant, ())
+        m, v = logit_moments(space, features, mean, covariance)
+        for _ in range(variational_updates):
+            alpha = update_alpha(m, weight)
+            xi = update_xi(m, v, alpha)
+            weight = bouchard_lambda(xi)
+        bound = expected_bound(m, v, alpha, xi, labels) - divergence(space, posterior, prior)
+        history.append(bound)
+        if not np.isfinite(bound):
+            raise MapError("the evidence bound is not finite; lower the prior variance")
+        if len(history) > 1 and history[-1] - history[-2] <= tolerance * abs(history[-2]):
+            break
+    assert posterior is not None
+    return Posterior(
+        posterior.mean, posterior.covariance, posterior.precision,
+        posterior.log_determinant, tuple(history),
+    )  # fmt: skip

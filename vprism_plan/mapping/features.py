@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The kernel transform of equation (1), kept sparse, and where its matrices are stored.
+
+phi(x) = [k(x, h_1), ..., k(x, h_H), 1] with k(x, h) = exp(-gamma |x - h|^2), exactly 0
+beyond the cutoff radius r. Two hinges more than 2 r apart are never both active, so with
+hinges sorted along their longest axis every Gram matrix fills only an envelope around
+the diagonal (plus the bias, which is last). Cholesky factors stay inside the envelope.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.spatial import cKDTree
+
+from vprism_plan._kernels import mapping as kernels
+from vprism_plan._threads import run_chunked
+
+_MAX_CELLS = 2_000_000
+
+
+def sorted_hinges(hinges: Float[np.ndarray, "h 3"]) -> Float[np.ndarray, "h 3"]:
+    """Return the hinges ordered along their longest extent, so that envelopes are narrow."""
+    extent = np.ptp(hinges, axis=0) if len(hinges) else np.zeros(3)
+    axes = np.argsort(-extent, kind="stable")
+    order = np.lexsort((hinges[:, axes[2]], hinges[:, axes[1]], hinges[:, axes[0]]))
+    return np.ascontiguousarray(hinges[order])
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureSpace:
+    """Hinge points (sorted, m), kernel and cutoff; M = H + 1 features, the bias last."""
+
+    hinges: Float[np.ndarray, "h 3"]
+    gamma: float
+    radius: float
+
+    @property
+    def size(self) -> int:
+        """Number of features M, bias included."""
+        return len(self.hinges) + 1
+
+    @cached_property
+    def row_first(self) -> Int64[np.ndarray, " m"]:
+        """First column of each envelope row."""
+        first = np.arange(self.size)
+        if len(self.hinges):
+            # The slack covers hinges exactly two radii apart, up to rounding.
+            pairs = cKDTree(self.hinges).query_pairs(
+                2.0 * self.radius * (1.0 + 1e-9), output_type="ndarray"
+            )
+            np.minimum.at(first, pairs.max(axis=1), pairs.min(axis=1))
+        first[-1] = 0
+        return first.astype(np.int64)
+
+    @cached_property
+    def base(self) -> Int64[np.ndarray, " m"]:
+        """Entry (i, j), j <= i, of the envelope is at base[i] + j."""
+        lengths = np.arange(self.size) - self.row_first + 1
+        return np.concatenate(([0], np.cumsum(lengths)[:-1])) - self.row_first
+
+    @cached_property
+    def envelope_size(self) -> int:
+        """Stored entries of one symmetric matrix."""
+        return int(self.base[-1]) + self.size
+
+    @property
+    def diagonal(self) -> Int64[np.ndarray, " m"]:
+        """Positions of the diagonal entries."""
+        return self.base + np.arange(self.size)
+
+    @cached_property
+    def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, float]:
+        """Cell list of the hinges as the kernels take it: starts, items, origin, edge, shape, r."""
+        if len(self.hinges) == 0:
+            return (
+                np.zeros(2, np.int64), np.zeros(0, np.int64), np.zeros(3), 1.0,
+                np.ones(3, np.int64), self.radius,
+            )  # fmt: skip
+        lower = self.hinges.min(axis=0)
+        edge = self.radius / 2.0
+        shape = np.floor(np.ptp(self.hinges, axis=0) / edge) + 1.0
+        while shape.prod() > _MAX_CELLS:
+            edge *= 2.0
+            shape = np.floor(np.ptp(self.hinges, axis=0) / edge) + 1.0
+        shape = shape.astype(np.int64)
+        index = np.minimum(((self.hinges - lower) / edge).astype(np.int64), shape - 1)
+        key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        items = np.argsort(key, kind="stable").astype(np.int64)
+        start = np.searchsorted(key[items], np.arange(shape.prod() + 1)).astype(np.int64)
+        return start, items, lower, edge, shape, self.radius
+
+    @property
+    def kernel_arguments(self) -> tuple:
+        """What every kernel that finds neighbours takes, after the points and blocks."""
+        return (self.hinges, *self.cells)
+
+    @cached_property
+    def bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """Box (m) outside which every kernel feature is exactly 0."""
+        if len(self.hinges) == 0:
+            return np.full(3, np.inf), np.full(3, -np.inf)
+        return self.hinges.min(axis=0) - self.radius, self.hinges.max(axis=0) + self.radius
+
+
+def make_blocks(
+    points: Float[np.ndarray, "n 3"], edge: float
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " b"]]:
+    """Group points by cells of `edge` (m): their order, and where each block starts.
+
+    A block holds at most `kernels.BLOCK` points; the starts end with n.
+    """
+    n = len(points)
+    if n == 0:
+        return np.zeros(0, np.int64), np.zeros(1, np.int64)
+    cells = np.floor(points / edge)
+    cells -= cells.min(axis=0)
+    shape = cells.max(axis=0).astype(np.int64) + 1
+    index = cells.astype(np.int64)
+    key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    start = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
+    length = np.diff(np.append(start, n))
+    pieces = -(-length // kernels.BLOCK)
+    within = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    block = np.repeat(start, pieces) + within * kernels.BLOCK
+    return order.astype(np.int64), np.append(block, n).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class BlockFeatures:
+    """Features of training points, block by block (points are stored in block order)."""
+
+    order: Int64[np.ndarray, " n"]
+    block_start: Int64[np.ndarray, " b1"]
+    near_start: Int64[np.ndarray, " b1"]
+    phi_start: Int64[np.ndarray, " b1"]
+    near: Int64[np.ndarray, " e"]
+    phi: Float[np.ndarray, " f"]
+
+    @property
+    def arguments(self) -> tuple:
+        """What the learning kernels take: starts, hinge lists and features."""
+        return self.block_start, self.near_start, self.phi_start, self.near, self.phi
+
+
+def block_features(
+    space: FeatureSpace, points: Float[np.ndarray, "n 3"], edge: float
+) -> BlockFeatures:
+    """Transform points (m), grouped in cells of `edge` (m)."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    order, block_start = make_blocks(points, edge)
+    blocks = len(block_start) - 1
+    count = np.zeros(blocks, np.int64)
+    cells = space.kernel_arguments
+
+    def count_chunk(piece: slice) -> None:
+        kernels.count_neighbours(points, order, block_start, piece.start, piece.stop, *cells, count)
+
+    run_chunked(count_chunk, blocks, 256)
+    near_start = np.concatenate(([0], np.cumsum(count + 1)))
+    phi_start = np.concatenate(([0], np.cumsum((count + 1) * np.diff(block_start))))
+    near = np.empty(near_start[-1], np.int64)
+    phi = np.empty(phi_start[-1])
+    reach = space.radius**2
+
+    def fill_chunk(piece: slice) -> None:
+        kernels.block_features(
+            points, order, block_start, piece.start, piece.stop, *cells,
+            space.gamma, reach, near_start, phi_start, near, phi,
+        )  # fmt: skip
+
+    run_chunked(fill_chunk, blocks, 256)
+    return BlockFeatures(order, block_start, near_start, phi_start, near, phi)

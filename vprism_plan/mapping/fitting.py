@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From observations to a map: samples, hinge points, EM (the paper's figure 2)."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from vprism_plan.errors import MapError, ObservationError
+from vprism_plan.mapping import negative_sampling as negatives
+from vprism_plan.mapping.config import MapConfig
+from vprism_plan.mapping.em import Posterior, Prior, fit_weights
+from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
+from vprism_plan.mapping.hinge_points import lattice_hinges, surface_hinges
+from vprism_plan.mapping.posterior import VPrismMap
+from vprism_plan.mapping.priors import expand_prior, weight_prior
+from vprism_plan.mapping.subsampling import grid_subsample
+from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.plane import Plane
+from vprism_plan.perception.plane_fitting import fit_plane
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Labelled points of one or several views.
+
+    Attributes:
+        points: (N, 3) m, world; thinned.
+        classes: (N,) 0 is empty, k is `object_ids[k - 1]`.
+        lower, upper: (C, 3) corners of the objects' boxes, m.
+        surface: the object points among `points`.
+        surface_ids: their labels.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    classes: Int64[np.ndarray, " n"]
+    lower: Float[np.ndarray, "c 3"]
+    upper: Float[np.ndarray, "c 3"]
+    surface: Float[np.ndarray, "s 3"]
+    surface_ids: Int64[np.ndarray, " s"]
+
+
+def fit_map(
+    observations: Observation | Sequence[Observation],
+    config: MapConfig | None = None,
+    seed: int = 0,
+) -> VPrismMap:
+    """Fit a map to one labelled view, or to several views of one scene in one world frame.
+
+    Args:
+        observations: views with labels; object ids mean the same in all of them.
+        config: parameters; the default is calibrated for planning.
+        seed: of all sampling. Same views, config and seed: same bits.
+
+    Raises:
+        ObservationError: no labels or no objects (see `segment_tabletop`).
+        PlaneNotFoundError: no support plane is known and none can be fitted.
+        MapError: the objects would need too many hinge points.
+    """
+    config = MapConfig() if config is None else config
+    views = (observations,) if isinstance(observations, Observation) else tuple(observations)
+    object_ids = _object_ids(views)
+    plane = _support_plane(views, seed)
+    rng = np.random.default_rng(seed)
+    data = training_data(views, object_ids, plane, config, rng)
+    space = FeatureSpace(
+        sorted_hinges(new_hinges(data, object_ids, plane, config, rng)),
+        config.gamma,
+        config.cutoff_radius,
+    )
+    prior = weight_prior(space, config, len(object_ids) + 1)
+    posterior = _learn(space, data, prior, config)
+    return VPrismMap(config, object_ids, plane, views, space, posterior, seed)
+
+
+def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
+    """See `VPrismMap.update`."""
+    seen = _object_ids((observation,))
+    views = (*old.views, observation)
+    if not set(seen) <= set(old.object_ids):
+        logger.info("new objects in the view: all %d views are fitted together", len(views))
+        return fit_map(views, old.config, old.seed)
+    config, plane = old.config, old.plane
+    rng = np.random.default_rng((old.seed, len(views)))
+    data = training_data((observation,), seen, plane, config, rng)
+    candidates = new_hinges(data, seen, plane, config, rng)
+    # New ground is where the old lattice did not reach: nodes it already has stay its own.
+    added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
+    hinges = np.concatenate([old.space.hinges, added])
+    space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
+    _check_hinge_count(space, config)
+    prior = expand_prior(old.space, old.posterior, space, config)
+    class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
+    data = TrainingData(
+        data.points, class_of[data.classes], data.lower, data.upper, data.surface, data.surface_ids
+    )
+    posterior = _learn(space, data, prior, config)
+    return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed)
+
+
+def training_data(
+    views: Sequence[Observation],
+    object_ids: tuple[int, ...],
+    plane: Plane,
+    config: MapConfig,
+    rng: np.random.Generator,
+) -> TrainingData:
+    """Observed points, negative samples and their subsampling (section V)."""
+    clouds = [view.points() for view in views]
+    points = np.concatenate([cloud for cloud, _ in clouds])
+    labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
+    lower, upper = negatives.box_centers(points, labels, object_ids)
+    centers = 0.5 * (lower + upper)
+    empty = [points[labels == 0]]
+    front: list[np.ndarray] = []
+    for view, (cloud, label) in zip(views, clouds, strict=True):
+        origin = view.camera_center
+        empty.append(
+            negatives.sample_rays(
+                cloud, origin, centers, config.object_radius, config.ray_step, rng
+            )
+        )
+        if config.front_distance is not None:
+            seen = negatives.sample_in_front(cloud[label > 0], origin, config.front_distance)
+            front.append(grid_subsample(seen, config.front_resolution))
+    empty.append(
+        negatives.sample_below_plane(
+            plane.normal, plane.offset, centers, config.object_radius,
+            config.below_plane_samples, rng, config.below_plane_margin,
+        )
+    )  # fmt: skip
+    near = _near_any(np.concatenate(empty), centers, config.object_radius)
+    free = np.concatenate([grid_subsample(near, config.empty_resolution), *front])
+    surfaces = [grid_subsample(points[labels == i], config.object_resolution) for i in object_ids]
+    counts = [len(s) for s in surfaces]
+    room = max(config.max_points - sum(counts), 1)
+    if len(free) > room:
+        logger.warning("%d empty points thinned at random to max_points", len(free))
+        free = free[np.sort(rng.permutation(len(free))[:room])]
+    surface = np.concatenate(surfaces)
+    index = np.repeat(np.arange(len(object_ids)), counts)
+    return TrainingData(
+        np.concatenate([free, surface]),
+        np.concatenate([np.zeros(len(free), np.int64), index + 1]),
+        lower,
+        upper,
+        surface,
+        np.asarray(object_ids, np.int64)[index],
+    )
+
+
+def new_hinges(
+    data: TrainingData,
+    object_ids: tuple[int, ...],
+    plane: Plane,
+    config: MapConfig,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "h 3"]:
+    """Return lattice and surface hinge points of the training data (m, world)."""
+    lattice = lattice_hinges(data.lower, data.upper, plane.normal, plane.offset, config)
+    surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
+    return np.concatenate([lattice, surface])
+
+
+def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapConfig) -> Posterior:
+    _check_hinge_count(space, config)
+    features = block_features(space, data.points, 0.4 * space.radius)
+    logger.info(
+        "fitting %d points, %d hinge points, %d classes",
+        len(data.points), len(space.hinges), prior.mean.shape[1],
+    )  # fmt: skip
+    return fit_weights(
+        space, features, data.classes, prior,
+        iterations=config.iterations,
+        variational_updates=config.variational_updates,
+        tolerance=config.tolerance,
+    )  # fmt: skip
+
+
+def _check_hinge_count(space: FeatureSpace, config: MapConfig) -> None:
+    if len(space.hinges) > config.max_hinges:
+        raise MapError(
+            f"the scene needs {len(space.hinges)} hinge points, more than max_hinges = "
+            f"{config.max_hinges}; raise it, raise hinge_spacing, or label fewer objects"
+        )
+
+
+def _object_ids(views: Sequence[Observation]) -> tuple[int, ...]:
+    if not views:
+        raise ObservationError("no observation given; fit_map needs at least one view")
+    for view in views:
+        if not isinstance(view, Observation):
+            raise ObservationError(
+                f"fit_map got a {type(view).__name__}; pass an Observation or a list of them"
+            )
+    if len(views) > 1 and not all(view.posed for view in views):
+        raise ObservationError(
+            "several views need T_world_camera each; without it their frames differ"
+        )
+    found: set[int] = set()
+    for view in views:
+        found.update(view.require_objects())
+        labelled = np.unique(view.labels)
+        lost = [int(i) for i in labelled if i > 0 and int(i) not in view.object_ids]
+        if lost:
+            logger.warning("objects %s have no depth return and are not in the map", lost)
+    return tuple(sorted(found))
+
+
+def _support_plane(views: Sequence[Observation], seed: int) -> Plane:
+    for view in views:
+        if view.plane is not None:
+            return view.plane
+    return fit_plane(views[0], seed=seed)
+
+
+def _near_any(
+    points: Float[np.ndarray, "n 3"], centers: Float[np.ndarray, "c 3"], radius: float
+) -> Float[np.ndarray, "m 3"]:
+    """Keep the points within `radius` of a centre."""
+    near = np.zeros(len(points), dtype=bool)
+    for center in centers:
+        near |= ((points - center) ** 2).sum(axis=1) <= radius**2
+    return points[near]
+
+
+def _farther_than(
+    points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"], distance: float
+) -> Float[np.ndarray, "k 3"]:
+    from scipy.spatial import cKDTree
+
+    nearest, _ = cKDTree(others).query(points)
+    return points[nearest > distance]

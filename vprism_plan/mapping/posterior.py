@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`VPrismMap`: the fitted posterior and the questions it answers."""
+
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.linalg import solve_triangular
+from torch import Tensor
+
+from vprism_plan._kernels import mapping as kernels
+from vprism_plan._threads import run_chunked
+from vprism_plan.errors import MapError
+from vprism_plan.mapping import prediction
+from vprism_plan.mapping.config import MapConfig
+from vprism_plan.mapping.em import Posterior
+from vprism_plan.mapping.factors import cholesky, dense_class
+from vprism_plan.mapping.features import FeatureSpace, make_blocks
+from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.plane import Plane
+
+MAX_LOG_ODDS = 40.0  # exp(-40) is 4e-18: nothing a float64 probability could still tell from 0
+
+
+class VPrismMap:
+    """A probabilistic segmentation map of a tabletop scene (V-PRISM).
+
+    Class 0 is *empty*, class k >= 1 is the object `object_ids[k - 1]`. Points are in the
+    world frame, metres. Made by `fit_map` and `load_map`, never changed afterwards;
+    `update` returns a new map.
+
+    Attributes:
+        config: the parameters it was fitted with.
+        object_ids: labels of the objects, sorted.
+        plane: support surface in the world frame.
+        views: every observation that was fitted.
+        seed: the seed of the fit.
+        posterior: Gaussian posterior of the weights (hinges in `space` order).
+        space: sorted hinge points and kernel.
+    """
+
+    def __init__(
+        self,
+        config: MapConfig,
+        object_ids: tuple[int, ...],
+        plane: Plane,
+        views: tuple[Observation, ...],
+        space: FeatureSpace,
+        posterior: Posterior,
+        seed: int,
+    ) -> None:
+        self.config = config
+        self.object_ids = tuple(object_ids)
+        self.plane = plane
+        self.views = tuple(views)
+        self.space = space
+        self.posterior = posterior
+        self.seed = seed
+
+    def __repr__(self) -> str:
+        return (
+            f"VPrismMap(object_ids={self.object_ids}, hinge_points={len(self.space.hinges)}, "
+            f"views={len(self.views)})"
+        )
+
+    @property
+    def n_classes(self) -> int:
+        """Number of classes K: the objects and "empty"."""
+        return len(self.object_ids) + 1
+
+    @cached_property
+    def hinge_points(self) -> Float[Tensor, "h 3"]:
+        """Hinge points (m, world), float64."""
+        return torch.from_numpy(self.space.hinges.copy())
+
+    @property
+    def history(self) -> tuple[float, ...]:
+        """Evidence lower bound (nats) after every EM iteration; never falls."""
+        return self.posterior.history
+
+    @property
+    def kernel_length(self) -> float:
+        """Length scale of the kernel, m."""
+        return self.config.kernel_length
+
+    @property
+    def cutoff_radius(self) -> float:
+        """Distance from a hinge beyond which it has no say, m."""
+        return self.space.radius
+
+    def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """Return the corners (m) of a box outside which `support` is exactly 0."""
+        lower, upper = self.space.bounds
+        return lower.copy(), upper.copy()
+
+    @cached_property
+    def unsupported_occupancy(self) -> float:
+        """P(occupied) where no hinge reaches, so that only the bias weights act."""
+        mean, variance = self._bias_moments()
+        return float(
+            prediction.occupied_probability(
+                torch.from_numpy(mean)[None], torch.from_numpy(variance)[None]
+            )[0]
+        )
+
+    # ------------------------------------------------------------------ predictions
+    def predict_proba(self, points: Any) -> Any:
+        """Return P(class | x) for points (N, 3) m: (N, K), every row sums to 1.
+
+        Torch in, torch out (same device and dtype, once differentiable); anything else
+        is taken as a numpy array and gives float64 numpy. Normalised approximation of
+        section IV-B. MapError on a wrong shape or a value that is not finite.
+        """
+        return self._evaluate(points, lambda m, v, s: prediction.class_probabilities(m, v))
+
+    def occupancy(self, points: Any) -> Any:
+        """Return P(occupied) = 1 - P(class 0) for points (N, 3) m: (N,)."""
+        return self._evaluate(points, lambda m, v, s: prediction.occupied_probability(m, v))
+
+    def entropy(self, points: Any) -> Any:
+        """Return the entropy (nats) of the class probabilities at points (N, 3) m: (N,)."""
+        return self._evaluate(points, lambda m, v, s: prediction.class_entropy(m, v))
+
+    def support(self, points: Any) -> Any:
+        """Return the kernel mass at points (N, 3) m: the sum of all kernel values, no bias: (N,).
+
+        0 means that the map knows nothing there but its prior.
+        """
+        return self._evaluate(points, lambda m, v, s: s)
+
+    def logit_moments(
+        self, points: Any
+    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+        """Return mean and variance of every class's logit at points (N, 3) m: two (N, K)."""
+        mean, variance, _ = self._moments(_checked_points(points))
+        return mean, variance
+
+    def occupancy_log_odds(self, points: Any) -> Float[np.ndarray, " n"]:
+        """Return log(P(occupied) / P(empty)) at points (N, 3) m, cut off at +-40: (N,)."""
+        mean, variance, _ = self._moments(_checked_points(points))
+        out = np.empty(len(mean))
+
+        def chunk(piece: slice) -> None:
+            kernels.normalised_log_odds(mean, variance, piece.start, piece.stop, MAX_LOG_ODDS, out)
+
+        run_chunked(chunk, len(out), 16384)
+        return out
+
+    def sample_weights(self, n: int, seed: int) -> Float[np.ndarray, "n m k"]:
+        """Draw n joint samples of all weights: (n, M, K), features in hinge order, bias last.
+
+        The logits of draw s at x are `phi(x) @ result[s]`. The same seed gives the same
+        draws. Classes are independent under the posterior, features are not.
+        """
+        if n < 1:
+            raise MapError(f"n is {n}; ask for at least 1 draw")
+        rng = np.random.default_rng(seed)
+        size = self.space.size
+        out = np.empty((n, size, self.n_classes))
+        for k in range(self.n_classes):
+            factor = cholesky(dense_class(self.space, self.posterior.precision, k))
+            noise = rng.standard_normal((size, n))
+            # precision = L L^T, so L^-T noise has the posterior covariance.
+            out[:, :, k] = solve_triangular(factor, noise, lower=True, trans="T").T
+        return out + self.posterior.mean
+
+    # ------------------------------------------------------------------ learning, files
+    def update(self, observation: Observation) -> "VPrismMap":
+        """Return a new map that has also seen `observation` (labelled, in the same world frame).
+
+        The old posterior is the prior; hinge points for ground the old map did not reach
+        enter with the configured prior. If the view shows objects the map does not know,
+        all views are fitted again together: a posterior cannot score a class it never had.
+
+        Raises:
+            ObservationError: the view has no labels or no objects.
+        """
+        from vprism_plan.mapping.fitting import update_map
+
+        return update_map(self, observation)
+
+    def save(self, path: str | Path) -> None:
+        """Write the map, views included, to a safetensors file; complete or not at all."""
+        from vprism_plan.mapping.serialization import save_map
+
+        save_map(self, path)
+
+    # ------------------------------------------------------------------ inside
+    def _bias_moments(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        return self.posterior.mean[-1].copy(), self.posterior.covariance[-1].copy()
+
+    def _moments(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+        """Return logit mean, variance and kernel mass; threads over blocks of near points."""
+        n = len(points)
+        bias_mean, bias_variance = self._bias_moments()
+        mean = np.empty((n, self.n_classes))
+        variance = np.empty((n, self.n_classes))
+        mean[:], variance[:] = bias_mean, bias_variance
+        support = np.zeros(n)
+        lower, upper = self.space.bounds
+        inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
+        if len(inside) == 0:
+            return mean, variance, support
+        order, block_start = make_blocks(points[inside], 0.4 * self.space.radius)
+        order = inside[order]
+        space, posterior = self.space, self.posterior
+
+        def chunk(piece: slice) -> None:
+            kernels.point_moments(
+                points, order, block_start, piece.start, piece.stop, *space.kernel_arguments,
+                space.gamma, space.radius**2, posterior.mean, posterior.covariance,
+                space.row_first, space.base, mean, variance, support,
+            )  # fmt: skip
+
+        run_chunked(chunk, len(block_start) - 1, 64)
+        return mean, variance, support
+
+    def _evaluate(self, points: Any, question: Callable[..., Tensor]) -> Any:
+        if not isinstance(points, Tensor):
+            values = [torch.from_numpy(a) for a in self._moments(_checked_points(points))]
+            return question(*values).numpy()
+        if not points.is_floating_point():
+            raise MapError(f"points have dtype {points.dtype}; use float32 or float64")
+        _check_shape(tuple(points.shape))
+        if not bool(torch.isfinite(points).all()):
+            raise MapError("points hold NaN or infinity; every coordinate must be finite (m)")
+        if points.device.type != "cpu":
+            return question(*self._dense_moments(points)).to(points.dtype)
+        if points.requires_grad and torch.is_grad_enabled():
+            moments = prediction.LogitMoments.apply(
+                points.to(torch.float64), self.space, self.posterior.mean, self.posterior.covariance
+            )
+        else:
+            array = np.ascontiguousarray(points.detach().to(torch.float64).numpy())
+            moments = tuple(torch.from_numpy(a) for a in self._moments(array))
+        return question(*moments).to(points.dtype)
+
+    def _dense_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Evaluate on the points' own device with plain torch (float64 where it has that)."""
+        dtype = torch.float32 if points.device.type == "mps" else torch.float64
+        hinges, mean, covariance = self._device_arrays(points.device, dtype)
+        return prediction.dense_moments(
+            points.to(dtype), hinges, mean, covariance, self.space.gamma, self.space.radius
+        )
+
+    def _device_arrays(
+        self, device: torch.device, dtype: torch.dtype
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        cache = self.__dict__.setdefault("_arrays_on", {})
+        if (device, dtype) not in cache:
+            dense = np.stack(
+                [
+                    dense_class(self.space, self.posterior.covariance, k)
+                    for k in range(self.n_classes)
+                ]
+            )
+            cache[device, dtype] = tuple(
+                torch.from_numpy(np.ascontiguousarray(a)).to(device, dtype)
+                for a in (self.space.hinges, self.posterior.mean, dense)
+            )
+        return cache[device, dtype]
+
+
+def _check_shape(shape: tuple[int, ...]) -> None:
+    if len(shape) != 2 or shape[1] != 3:
+        raise MapError(f"points have shape {shape}; they must be (N, 3), world coordinates in m")
+
+
+def _checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
+    try:
+        array = np.ascontiguousarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MapError(f"points cannot be read as numbers: {error}; pass (N, 3) metres") from error
+    _check_shape(array.shape)
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise MapError(
+            f"points[{row}] is {array[row].tolist()}; every coordinate must be finite (m)"
+        )
+    return array
