@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The last word on a path: every edge of the array that is handed out, checked again."""
+
+import logging
+import math
+import time
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.planning._protocol import CheckerLike
+from vprism_plan.planning.ompl_adapter import check_straight
+from vprism_plan.planning.result import PlanReport, PlanResult
+
+_log = logging.getLogger(__name__)
+
+
+def interpolated(path: Float[np.ndarray, "t dof"], spacing: float) -> Float[np.ndarray, "n dof"]:
+    """Insert equally spaced waypoints on every edge longer than `spacing`."""
+    pieces = [path[:1]]
+    for a, b in pairwise(path):
+        n = max(1, math.ceil(float(np.linalg.norm(b - a)) / spacing))
+        inner = a + (b - a) * (np.arange(1, n)[:, None] / n)
+        pieces += [inner, b[None]]
+    return np.concatenate(pieces)
+
+
+def verified(
+    checker: CheckerLike,
+    path: Float[np.ndarray, "t dof"],
+    clearance_step: float,
+    report: PlanReport,
+) -> PlanResult:
+    """Check every edge of the final waypoints again, and measure the path."""
+    began = time.perf_counter()
+    verdicts: list[Any] = []
+    failed = _first_bad_edge(checker, path, verdicts)
+    report = replace(
+        report,
+        verification_time=time.perf_counter() - began,
+        motion_checks=report.motion_checks + len(verdicts),
+    )
+    if failed is not None:
+        _log.warning("edge %d of the final path failed its verification", failed)
+        return PlanResult(
+            path=None,
+            status="verification_failed",
+            report=replace(report, goal_index=None),
+            message=f"edge {failed} of {len(path) - 1} of the final path was refused when checked "
+            f"again: {one_line(verdicts[-1])}",
+            approximate_path=path,
+            explanation=verdicts[-1],
+        )
+    clearances = [checker.clearance(q) for q in interpolated(path, clearance_step)]
+    report = replace(
+        report,
+        path_length=float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+        waypoints=len(path),
+        min_clearance=float(min(clearances)),
+        clearance_samples=len(clearances),
+        certified=all(verdict.certified for verdict in verdicts),
+        tolerance=float(max(verdict.tolerance for verdict in verdicts)),
+        shares=_largest_shares(checker, path),
+    )
+    return PlanResult(
+        path=path,
+        status="exact",
+        report=report,
+        message=f"path of {len(path)} waypoints, length {report.path_length:.3g}, smallest "
+        f"clearance {report.min_clearance:.3g} m in {len(clearances)} samples",
+    )
+
+
+def _first_bad_edge(
+    checker: CheckerLike, path: Float[np.ndarray, "t dof"], verdicts: list[Any]
+) -> int | None:
+    """Append a report per checked motion; return the first refused edge, None if all pass."""
+    turns = np.asarray(checker.robot.continuous, dtype=bool)
+
+    def check(qa: np.ndarray, qb: np.ndarray) -> bool:
+        verdicts.append(checker.check_motion_report(qa, qb))
+        return bool(verdicts[-1].valid and checker.check_motion(qa, qb))
+
+    for edge, (a, b) in enumerate(pairwise(path)):
+        if not check_straight(check, a, b, turns):
+            return edge
+    return None
+
+
+def _largest_shares(checker: CheckerLike, path: Float[np.ndarray, "t dof"]) -> dict[str, float]:
+    """Return the largest share of each kind of unseen space at the waypoints."""
+    largest: dict[str, float] = {}
+    for q in path:
+        for kind, share in checker.explain(q).shares.items():
+            largest[kind] = max(largest.get(kind, 0.0), float(share))
+    return largest
+
+
+def one_line(report: Any) -> str:
+    """Return a report's text without line breaks."""
+    return " ".join(report.text().split())

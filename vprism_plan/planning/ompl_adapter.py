@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The two classes that put a V-PRISM world into anybody's OMPL program.
+
+    si.setStateValidityChecker(VPrismStateValidityChecker(si, checker))
+    si.setMotionValidator(VPrismMotionValidator(si, checker))
+
+Both keep the state space and never the `SpaceInformation`: a Python motion validator
+that holds `si` closes a reference cycle that neither side can collect.
+"""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from ompl import base as ob
+
+from vprism_plan.planning._protocol import CheckerLike
+from vprism_plan.planning._spaces import StateReader
+
+# A continuous joint that moves further than this is checked in pieces, so that "the
+# straight line" and "the shorter way round" are the same motion for every checker.
+_UNAMBIGUOUS_TURN = 0.9 * math.pi
+
+
+class VPrismStateValidityChecker(ob.StateValidityChecker):
+    """OMPL's question "is this state valid?", answered by a checker.
+
+    Attributes:
+        checks: number of states asked about so far.
+    """
+
+    def __init__(self, si: Any, checker: CheckerLike) -> None:
+        """Attach `checker` to the space of `si` (one dimension per joint, flat order).
+
+        Raises PlanningError if the dimensions differ or the space is not made of
+        RealVector and SO2 parts.
+        """
+        super().__init__(si)
+        self.checks = 0
+        self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
+        self._clearance = checker.clearance
+        self._is_valid = checker.is_valid_buffer
+        # Looked up once: this runs for every state a planner samples.
+        self._fast = self._reader.fast
+        self._buffers = self._reader.buffers
+        self._serialize: Any = self._reader.space.serialize if self._fast else None
+
+    def isValid(self, state: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
+        """Return whether `state` is valid; exceptions of the checker propagate.
+
+        OMPL dispatches its longer overloads to this name too, hence `*unused`.
+        """
+        self.checks += 1
+        if self._fast:
+            buffers = self._buffers
+            self._serialize(buffers.capsule_a, state)
+            return bool(self._is_valid(buffers.a))
+        # The bindings accept nothing but a genuine bool.
+        return bool(self._is_valid(self._reader.read(state)))
+
+    def clearance(self, state: Any, *unused: Any) -> float:
+        """Return metres to the nearest obstacle, negative inside one."""
+        return float(self._clearance(self._reader.read(state).copy()))
+
+
+class VPrismMotionValidator(ob.MotionValidator):
+    """OMPL's question "is this motion valid?", answered continuously by a checker.
+
+    OMPL's bindings do not pass `lastValid` back, so planners that would keep the valid
+    part of a blocked motion (KPIECE1) keep nothing of it; `last_valid` answers that
+    question in Python. OMPL's own motion counters stay at zero for the same reason.
+
+    Attributes:
+        checks: number of motions asked about so far.
+    """
+
+    def __init__(self, si: Any, checker: CheckerLike) -> None:
+        """Attach `checker` to the space of `si`; errors as for the state checker."""
+        super().__init__(si)
+        self.checks = 0
+        self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
+        self._is_valid = checker.is_valid_buffer
+        self._check_motion = checker.check_motion_buffer
+        self._wraps = np.array(self._reader.wraps)
+        self._turns = self._wraps | np.asarray(checker.robot.continuous, dtype=bool)
+        self._any_turns = bool(self._turns.any())
+
+    def checkMotion(self, s1: Any, s2: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
+        """Return whether the straight motion from s1 to s2 is valid, both ends included.
+
+        RRT, RRTstar and KPIECE1 test no other state of the motion themselves.
+        """
+        self.checks += 1
+        qa, qb = self._reader.read_pair(s1, s2)
+        if not self._is_valid(qb):
+            return False
+        if self._any_turns:
+            return check_straight(self._check_motion, qa, self._unwrapped(qa, qb), self._turns)
+        return bool(self._check_motion(qa, qb))
+
+    def _unwrapped(
+        self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]
+    ) -> Float[np.ndarray, " dof"]:
+        """Return qb with wrapping coordinates moved to where interpolation from qa ends."""
+        return qa + shortest_step(qa, qb, self._wraps)
+
+
+def shortest_step(
+    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], wraps: Any
+) -> Float[np.ndarray, " dof"]:
+    """Return qb - qa, taking the shorter way round in the coordinates marked in `wraps`.
+
+    Angles lie in [-pi, pi]. This mirrors OMPL's own rule term by term: at exactly half
+    a turn the plain difference is kept, one bit beyond it the other way is taken.
+    """
+    step = qb - qa
+    far = wraps & (np.abs(step) > math.pi)
+    if far.any():
+        step[far] -= np.copysign(2.0 * math.pi, step[far])
+    return step
+
+
+def check_straight(
+    check_motion: Any, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], turns: Any
+) -> bool:
+    """Check the straight line from qa to qb however far its continuous joints turn.
+
+    A checker may or may not take the shorter way round; pieces of less than half a
+    turn leave it no choice. `turns` marks the joints this concerns.
+    """
+    widest = float(np.max(np.abs(qb - qa), where=turns, initial=0.0))
+    pieces = max(1, math.ceil(widest / _UNAMBIGUOUS_TURN))
+    if pieces == 1:
+        return bool(check_motion(qa, qb))
+    corners = [qa + (qb - qa) * (k / pieces) for k in range(pieces)] + [qb]
+    return all(bool(check_motion(a, b)) for a, b in pairwise(corners))
+
+
+def last_valid(
+    checker: CheckerLike,
+    qa: Float[np.ndarray, " dof"],
+    qb: Float[np.ndarray, " dof"],
+    tolerance: float = 1e-3,
+) -> tuple[Float[np.ndarray, " dof"] | None, float]:
+    """Return how far the straight motion from qa to qb is certified valid.
+
+    Bisects with `checker.check_motion`, so every part up to the answer is certified.
+
+    Args:
+        checker: the checker.
+        qa: start (dof,), radians or metres.
+        qb: end (dof,).
+        tolerance: width of the last bisection interval, as a fraction of the motion.
+
+    Returns:
+        The furthest certified configuration and its fraction in [0, 1]; (None, 0.0)
+        if qa itself is invalid.
+    """
+    qa = np.ascontiguousarray(qa, dtype=np.float64)
+    qb = np.ascontiguousarray(qb, dtype=np.float64)
+    turns = np.asarray(checker.robot.continuous, dtype=bool)
+    if not checker.is_valid(qa):
+        return None, 0.0
+    if check_straight(checker.check_motion, qa, qb, turns):
+        return qb.copy(), 1.0
+    good, bad = 0.0, 1.0
+    while bad - good > tolerance:
+        middle = 0.5 * (good + bad)
+        left, right = qa + good * (qb - qa), qa + middle * (qb - qa)
+        if check_straight(checker.check_motion, left, right, turns):
+            good = middle
+        else:
+            bad = middle
+    return qa + good * (qb - qa), good

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a planning query answers: a verdict with its numbers, never an exception."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Status = Literal[
+    "exact", "approximate", "timeout", "invalid_start", "invalid_goal", "verification_failed"
+]
+
+
+@dataclass(frozen=True)
+class PlanReport:
+    """The numbers behind a `PlanResult`.
+
+    Attributes:
+        planner: name of the planner that was asked for.
+        seed: the seed of the query.
+        time_limit: seconds of wall time the search was allowed.
+        planning_time: seconds spent searching.
+        simplification_time: seconds spent shortening the path.
+        verification_time: seconds spent re-checking the final waypoints.
+        state_checks: states whose validity was asked for, start and goal included.
+        motion_checks: motions that were checked, verification included.
+        path_length: Euclidean length of the path in joint space (radians and metres
+            alike), NaN without a path.
+        waypoints: number of rows of the path, 0 without one.
+        min_clearance: smallest `checker.clearance` at the samples along the path,
+            metres, NaN without a path. A sampled value: the path's safety rests on the
+            continuous re-verification, not on it.
+        clearance_samples: number of those samples.
+        direct: whether the straight motion to the goal was valid, so that no search ran.
+        goal_index: which of several goal configurations (solutions of a pose) was
+            reached, None if none was.
+        certified: whether every edge was covered by computed clearances, with nothing
+            left to sampling.
+        tolerance: largest motion, metres, between a point of the path and a
+            configuration known to be free (0 when certified), NaN without a path.
+        shares: largest share of the robot's volume, at the waypoints, that lies in each
+            kind of unseen space ("occluded", "unobserved", ...); what the checker
+            reports, empty if it reports nothing.
+    """
+
+    planner: str
+    seed: int
+    time_limit: float
+    planning_time: float = 0.0
+    simplification_time: float = 0.0
+    verification_time: float = 0.0
+    state_checks: int = 0
+    motion_checks: int = 0
+    path_length: float = float("nan")
+    waypoints: int = 0
+    min_clearance: float = float("nan")
+    clearance_samples: int = 0
+    direct: bool = False
+    goal_index: int | None = None
+    certified: bool = False
+    tolerance: float = float("nan")
+    shares: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """The verdict on a planning query.
+
+    Attributes:
+        path: verified waypoints (T, dof), radians and metres, start first; None unless
+            the status is "exact". Continuous joints are unwrapped: consecutive rows
+            differ by the motion that was checked, so the last row equals the goal up to
+            whole turns of those joints.
+        status: "exact" (path reaches the goal and every edge was re-verified),
+            "approximate" (ended near the goal only), "timeout" (nothing found),
+            "invalid_start", "invalid_goal", "verification_failed".
+        report: the numbers.
+        message: one line for people: what happened and why.
+        approximate_path: waypoints that do NOT solve the query: of an approximate
+            solution, or those that failed verification. None otherwise.
+        explanation: the checker's `explain` report for an invalid start or goal, or its
+            `check_motion_report` for the first edge that failed verification, None
+            otherwise.
+    """
+
+    path: np.ndarray | None
+    status: Status
+    report: PlanReport
+    message: str = ""
+    approximate_path: np.ndarray | None = None
+    explanation: Any = None
+
+    @property
+    def solved(self) -> bool:
+        """True only if the path reaches the goal and was verified."""
+        return self.status == "exact"

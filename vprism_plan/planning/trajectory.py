@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""From a verified path to a timed trajectory that never leaves it.
+
+The checker certified straight lines in joint space. Blending corners would leave them,
+so the motion stops where the direction changes, and nowhere else. Between stops all
+joints share one trapezoidal profile along the line.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from vprism_plan.errors import PlanningError
+
+# Without stated acceleration limits a joint reaches its full speed in this time.
+_SECONDS_TO_FULL_SPEED = 0.5
+# Unit directions closer than this are one line; the path is left by no more.
+_SAME_DIRECTION = 1e-9
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A motion over time, as cubic pieces.
+
+    Every change of acceleration is a point, so cubic interpolation of positions and
+    velocities, which is what trajectory controllers do when they are given no
+    accelerations, reproduces the trapezoidal profile exactly and stays on the path.
+
+    Attributes:
+        times: (n,) seconds from the start, increasing, the first is 0.
+        positions: (n, dof) radians or metres.
+        velocities: (n, dof) per second.
+    """
+
+    times: np.ndarray
+    positions: np.ndarray
+    velocities: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        """Seconds from start to end."""
+        return float(self.times[-1])
+
+    def sample(
+        self, times: Float[np.ndarray, " m"]
+    ) -> tuple[Float[np.ndarray, "m dof"], Float[np.ndarray, "m dof"]]:
+        """Return positions and velocities at given times, held at rest outside the motion."""
+        t = np.clip(np.asarray(times, dtype=np.float64), 0.0, self.duration)
+        if len(self.times) == 1:
+            return self.positions[np.zeros(len(t), int)], self.velocities[np.zeros(len(t), int)]
+        i = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
+        h = (self.times[i + 1] - self.times[i])[:, None]
+        u = (t - self.times[i])[:, None] / h
+        p, q = self.positions[i], self.positions[i + 1]
+        v, w = h * self.velocities[i], h * self.velocities[i + 1]
+        a, b = 3.0 * (q - p) - 2.0 * v - w, 2.0 * (p - q) + v + w
+        return p + u * (v + u * (a + u * b)), (v + u * (2.0 * a + 3.0 * u * b)) / h
+
+
+def time_parameterize(
+    robot: Any,
+    path: Float[np.ndarray, "t dof"],
+    velocity_limits: ArrayLike | None = None,
+    acceleration_limits: ArrayLike | None = None,
+    scale: float = 1.0,
+) -> Trajectory:
+    """Time a path so that no joint exceeds its velocity or acceleration limit.
+
+    Args:
+        robot: brings `joint_names` and the default `velocity_limits`.
+        path: waypoints (t, dof), at least one, as in `PlanResult.path`.
+        velocity_limits: (dof,) rad/s or m/s; the robot's own if None.
+        acceleration_limits: (dof,) per second squared; if None, each joint reaches its
+            velocity limit in half a second.
+        scale: share of both limits to use, more than 0 and at most 1.
+
+    Returns:
+        The trajectory: at rest at both ends and at every corner of the path, on the
+        path throughout, through every waypoint.
+
+    Raises:
+        PlanningError: the path or a limit is not usable; names the joint and the value.
+    """
+    path = np.asarray(path, dtype=np.float64)
+    names = tuple(robot.joint_names)
+    if path.ndim != 2 or path.shape[1] != len(names) or len(path) == 0:
+        raise PlanningError(
+            f"path has shape {path.shape}; it must be (waypoints, {len(names)}) with at least "
+            "one waypoint"
+        )
+    if not np.isfinite(path).all():
+        raise PlanningError("the path holds NaN or infinite values")
+    if not 0.0 < scale <= 1.0:
+        raise PlanningError(f"scale is {scale!r}; it must be more than 0 and at most 1")
+    given = robot.velocity_limits if velocity_limits is None else velocity_limits
+    speed = _limits("velocity", given, names)
+    push = speed / _SECONDS_TO_FULL_SPEED
+    if acceleration_limits is not None:
+        push = _limits("acceleration", acceleration_limits, names)
+
+    times, positions, velocities = [0.0], [path[0]], [np.zeros(len(names))]
+    for line in _straight_lines(path):
+        began = times[-1]
+        for t, q, v in _timed(line, scale * speed, scale * push):
+            times.append(began + t)
+            positions.append(q)
+            velocities.append(v)
+    return Trajectory(np.array(times), np.array(positions), np.array(velocities))
+
+
+def _limits(kind: str, values: ArrayLike, names: tuple[str, ...]) -> Float[np.ndarray, " dof"]:
+    limits = np.asarray(values, dtype=np.float64)
+    if limits.shape != (len(names),):
+        raise PlanningError(
+            f"{kind} limits have shape {limits.shape}; one per joint is needed: {', '.join(names)}"
+        )
+    for name, limit in zip(names, limits, strict=True):
+        if not (math.isfinite(limit) and limit > 0.0):
+            raise PlanningError(
+                f"{kind} limit of joint {name!r} is {limit}; it must be finite and more than 0 "
+                f"(pass {kind}_limits if the robot's description has none)"
+            )
+    return limits
+
+
+def _straight_lines(path: Float[np.ndarray, "t dof"]) -> Iterator[Float[np.ndarray, "k dof"]]:
+    """Yield the waypoints of each maximal straight piece, both ends included."""
+    moved = np.concatenate([[True], np.any(np.diff(path, axis=0) != 0.0, axis=1)])
+    points = path[moved]
+    steps = np.diff(points, axis=0)
+    directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+    first = 0
+    for i in range(1, len(points)):
+        last = i == len(points) - 1
+        if last or np.linalg.norm(directions[i] - directions[first]) > _SAME_DIRECTION:
+            yield points[first : i + 1]
+            first = i
+
+
+def _timed(
+    line: Float[np.ndarray, "k dof"],
+    speed: Float[np.ndarray, " dof"],
+    push: Float[np.ndarray, " dof"],
+) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+    """Yield (time, position, velocity) along a line, its start left out.
+
+    With s in [0, 1] along the line and s' <= v, s'' <= a, each the tightest of the
+    joints' limits, the fastest motion from rest to rest is a trapezoid in s'.
+    """
+    whole = line[-1] - line[0]
+    moving = whole != 0.0
+    size = np.abs(whole[moving])
+    v, a = float(np.min(speed[moving] / size)), float(np.min(push[moving] / size))
+    ramp = min(v / a, math.sqrt(1.0 / a))
+    top = a * ramp
+    cruise = 1.0 / top - ramp
+    total = cruise + 2.0 * ramp
+    inner = np.linalg.norm(line[1:-1] - line[0], axis=1) / np.linalg.norm(whole)
+    events = [
+        (_time_at(float(s), ramp, top, total), q) for s, q in zip(inner, line[1:-1], strict=True)
+    ]
+    knees = [ramp] if cruise <= 1e-9 * total else [ramp, ramp + cruise]
+    events += [(t, line[0] + _profile(t, ramp, top, total)[0] * whole) for t in knees]
+    events.sort(key=lambda event: event[0])
+    previous = 0.0
+    for t, q in events:
+        # A knee that falls on a waypoint is one point, not two.
+        if t - previous > 1e-9 * total and total - t > 1e-9 * total:
+            yield t, q, _profile(t, ramp, top, total)[1] * whole
+            previous = t
+    yield total, line[-1], 0.0 * whole
+
+
+def _profile(t: float, ramp: float, top: float, total: float) -> tuple[float, float]:
+    """Return s and s' of the trapezoid at time t."""
+    rate = top / ramp
+    if t <= ramp:
+        return 0.5 * rate * t * t, rate * t
+    if t < total - ramp:
+        return top * (t - 0.5 * ramp), top
+    left = total - t
+    return 1.0 - 0.5 * rate * left * left, rate * left
+
+
+def _time_at(s: float, ramp: float, top: float, total: float) -> float:
+    """Return the time at which the trapezoid reaches s."""
+    rate = top / ramp
+    if s <= 0.5 * top * ramp:
+        return math.sqrt(2.0 * s / rate)
+    if s <= 1.0 - 0.5 * top * ramp:
+        return s / top + 0.5 * ramp
+    return total - math.sqrt(2.0 * (1.0 - s) / rate)
