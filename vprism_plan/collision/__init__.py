@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""World and robot in, verdicts with reasons out."""
+
+from vprism_plan.collision.checker import CollisionChecker as CollisionChecker
+from vprism_plan.collision.config import CheckerConfig as CheckerConfig
+from vprism_plan.collision.reports import Contact as Contact
+from vprism_plan.collision.reports import MotionReport as MotionReport
+from vprism_plan.collision.reports import StateReport as StateReport
+
+__all__ = ["CheckerConfig", "CollisionChecker", "Contact", "MotionReport", "StateReport"]

@@ -1,0 +1,532 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Compiled kinematics, state checks and edge checks for single queries on the CPU.
+
+A robot and a world reach these kernels as a few packed arrays, because every array
+argument costs a call about 60 ns and the whole state check takes about one
+microsecond. `vprism_plan.collision._packing` documents and fills the layouts:
+
+robot floats `rf`, robot integers `ri`:
+    ri[0:8]   = n_frames, n_spheres, n_links, n_pairs, dof, most spheres on a link, 0, 0
+    ri[8:16]  = offsets into ri of: frame ints (parent, kind, q index), link ints
+                (frame, first sphere, end sphere, fixed), pairs (a, b), continuous flags
+    ri[16:24] = offsets into rf of: frame floats (R 9, t 3, multiplier, offset), spheres
+                (x, y, z, radius), link bounding spheres (x, y, z, radius), limits
+                (lower, upper), reach table (n_frames, n_links), self margin
+
+Frame 0 is the base; every other frame moves about or along its own z axis.
+
+world floats `wf` = origin x, y, z, spacing, outside_occupied, n_planes, margin, then
+    four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset).
+distance field `D` (nx, ny, nz) float32: lower bounds of the signed distance at nodes.
+"""
+
+import numpy as np
+from numba import njit
+
+_INF = np.inf
+
+
+@njit(cache=True, nogil=True)
+def fk_frames(q, rf, ri, T):
+    """Fill T (n_frames, 12) with the world pose of every frame: R row-major, then t."""
+    n_frames = ri[0]
+    fi = ri[8]
+    ff = ri[16]
+    for k in range(12):
+        T[0, k] = rf[ff + k]
+    for i in range(1, n_frames):
+        p = ri[fi + 3 * i]
+        kind = ri[fi + 3 * i + 1]
+        o = ff + 14 * i
+        value = rf[o + 12] * q[ri[fi + 3 * i + 2]] + rf[o + 13]
+        ox = rf[o + 9]
+        oy = rf[o + 10]
+        oz = rf[o + 11]
+        if kind == 1:
+            s = np.sin(value)
+            c = np.cos(value)
+        else:
+            s = 0.0
+            c = 1.0
+        for r in range(3):
+            a = T[p, 3 * r]
+            b = T[p, 3 * r + 1]
+            d = T[p, 3 * r + 2]
+            x = a * rf[o] + b * rf[o + 3] + d * rf[o + 6]
+            y = a * rf[o + 1] + b * rf[o + 4] + d * rf[o + 7]
+            z = a * rf[o + 2] + b * rf[o + 5] + d * rf[o + 8]
+            T[i, 3 * r] = c * x + s * y
+            T[i, 3 * r + 1] = c * y - s * x
+            T[i, 3 * r + 2] = z
+            t = T[p, 9 + r] + a * ox + b * oy + d * oz
+            if kind == 2:
+                t += z * value
+            T[i, 9 + r] = t
+
+
+@njit(cache=True, nogil=True)
+def place_spheres(q, rf, ri, centers):
+    """Fill centers (n_spheres, 3) with world sphere centres: the kinematics twin."""
+    T = np.empty((ri[0], 12))
+    fk_frames(q, rf, ri, T)
+    li = ri[9]
+    so = ri[17]
+    for link in range(ri[2]):
+        f = ri[li + 4 * link]
+        for s in range(ri[li + 4 * link + 1], ri[li + 4 * link + 2]):
+            _transform(T, f, rf, so + 4 * s, centers, s)
+
+
+@njit(cache=True, nogil=True)
+def place_spheres_batch(Q, rf, ri, centers):
+    """Fill centers (n, n_spheres, 3) for configurations Q (n, dof)."""
+    for n in range(Q.shape[0]):
+        place_spheres(Q[n], rf, ri, centers[n])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _transform(T, f, rf, o, out, row):
+    x = rf[o]
+    y = rf[o + 1]
+    z = rf[o + 2]
+    out[row, 0] = T[f, 0] * x + T[f, 1] * y + T[f, 2] * z + T[f, 9]
+    out[row, 1] = T[f, 3] * x + T[f, 4] * y + T[f, 5] * z + T[f, 10]
+    out[row, 2] = T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]
+
+
+@njit(cache=True, nogil=True)
+def field_bound(D, wf, x, y, z, enough):
+    """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
+
+    Distance is 1-Lipschitz, so every node gives d_i - |x - x_i|; the best of the cell's
+    eight is returned. The nearest node is tried first: a bound above `enough` ends
+    the search, which is the common case.
+
+    Outside the grid, with c the closest point of the grid box, every obstacle o of the
+    grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex.
+    """
+    h = wf[3]
+    nx = D.shape[0]
+    ny = D.shape[1]
+    nz = D.shape[2]
+    gx = (x - wf[0]) / h
+    gy = (y - wf[1]) / h
+    gz = (z - wf[2]) / h
+    cx = min(max(gx, 0.0), nx - 1.0)
+    cy = min(max(gy, 0.0), ny - 1.0)
+    cz = min(max(gz, 0.0), nz - 1.0)
+    out2 = (gx - cx) ** 2 + (gy - cy) ** 2 + (gz - cz) ** 2
+    if not (out2 < 1e18):
+        return -_INF  # not finite, or absurdly far: never "free"
+    if out2 > 0.0 and wf[4] > 0.0:
+        return -h * np.sqrt(out2)
+    i = int(cx + 0.5)
+    j = int(cy + 0.5)
+    k = int(cz + 0.5)
+    best = D[i, j, k] - h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
+    if best <= enough or out2 > 0.0:
+        i0 = min(int(cx), nx - 2)
+        j0 = min(int(cy), ny - 2)
+        k0 = min(int(cz), nz - 2)
+        for a in range(2):
+            ex = (cx - i0 - a) ** 2
+            for b in range(2):
+                ey = ex + (cy - j0 - b) ** 2
+                for c in range(2):
+                    d = D[i0 + a, j0 + b, k0 + c] - h * np.sqrt(ey + (cz - k0 - c) ** 2)
+                    best = max(best, d)
+    if out2 > 0.0:
+        inside = max(best, 0.0)
+        best = np.sqrt(out2 * h * h + inside * inside)
+    elif wf[4] > 0.0:
+        faces = min(gx, nx - 1.0 - gx, gy, ny - 1.0 - gy)
+        best = min(best, h * min(faces, gz, nz - 1.0 - gz))
+    return best
+
+
+@njit(cache=True, nogil=True)
+def plane_bound(wf, x, y, z):
+    """Distance from a point to the nearest half-space obstacle (exact for each one)."""
+    best = _INF
+    for p in range(int(wf[5])):
+        o = 7 + 4 * p
+        best = min(best, wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3])
+    return best
+
+
+@njit(cache=True, nogil=True)
+def world_bound(D, wf, x, y, z, enough):
+    """Lower bound of the distance from a point to everything in the world."""
+    return min(plane_bound(wf, x, y, z), field_bound(D, wf, x, y, z, enough))
+
+
+@njit(cache=True, nogil=True)
+def within_limits(q, rf, ri):
+    """Whether every joint is finite and, unless continuous, inside its limits."""
+    lo = ri[19]
+    co = ri[11]
+    for j in range(ri[4]):
+        v = q[j]
+        if not np.isfinite(v):
+            return False
+        if ri[co + j] == 0 and not (rf[lo + 2 * j] <= v <= rf[lo + 2 * j + 1]):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _link_clear(link, T, rf, ri, D, wf, margin, scratch):
+    """Whether a link keeps more than `margin` from the world; its bounding sphere first."""
+    li = ri[9]
+    f = ri[li + 4 * link]
+    bo = ri[18] + 4 * link
+    _transform(T, f, rf, bo, scratch, 0)
+    x = scratch[0, 0]
+    y = scratch[0, 1]
+    z = scratch[0, 2]
+    need = margin + rf[bo + 3]
+    plane_ok = plane_bound(wf, x, y, z) > need
+    field_ok = field_bound(D, wf, x, y, z, need) > need
+    if plane_ok and field_ok:
+        return True
+    so = ri[17]
+    for s in range(ri[li + 4 * link + 1], ri[li + 4 * link + 2]):
+        _transform(T, f, rf, so + 4 * s, scratch, 0)
+        x = scratch[0, 0]
+        y = scratch[0, 1]
+        z = scratch[0, 2]
+        need = margin + rf[so + 4 * s + 3]
+        if not plane_ok and not plane_bound(wf, x, y, z) > need:
+            return False
+        if not field_ok and not field_bound(D, wf, x, y, z, need) > need:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _link_clearance(link, T, rf, ri, D, wf, enough, scratch):
+    """Lower bound of the distance from a link to the world, exact per sphere below `enough`.
+
+    A sphere is never nearer than the link's bounding sphere, so each bound is the
+    larger of the two: that keeps this consistent with `_link_clear`.
+    """
+    li = ri[9]
+    f = ri[li + 4 * link]
+    bo = ri[18] + 4 * link
+    _transform(T, f, rf, bo, scratch, 0)
+    r = rf[bo + 3]
+    plane_all = plane_bound(wf, scratch[0, 0], scratch[0, 1], scratch[0, 2]) - r
+    field_all = field_bound(D, wf, scratch[0, 0], scratch[0, 1], scratch[0, 2], _INF) - r
+    if min(plane_all, field_all) >= enough:
+        return min(plane_all, field_all)
+    best = _INF
+    so = ri[17]
+    for s in range(ri[li + 4 * link + 1], ri[li + 4 * link + 2]):
+        _transform(T, f, rf, so + 4 * s, scratch, 0)
+        x = scratch[0, 0]
+        y = scratch[0, 1]
+        z = scratch[0, 2]
+        r = rf[so + 4 * s + 3]
+        plane = max(plane_bound(wf, x, y, z) - r, plane_all)
+        field = max(field_bound(D, wf, x, y, z, _INF) - r, field_all)
+        best = min(best, plane, field)
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _pair_gap(pair, T, rf, ri, enough, ca, cb):
+    """Lower bound of the gap between two links; exact over spheres below `enough`."""
+    li = ri[9]
+    a = ri[ri[10] + 2 * pair]
+    b = ri[ri[10] + 2 * pair + 1]
+    fa = ri[li + 4 * a]
+    fb = ri[li + 4 * b]
+    bo = ri[18]
+    _transform(T, fa, rf, bo + 4 * a, ca, 0)
+    _transform(T, fb, rf, bo + 4 * b, cb, 0)
+    d2 = (ca[0, 0] - cb[0, 0]) ** 2 + (ca[0, 1] - cb[0, 1]) ** 2 + (ca[0, 2] - cb[0, 2]) ** 2
+    reach = rf[bo + 4 * a + 3] + rf[bo + 4 * b + 3]
+    if d2 > (reach + enough) ** 2:
+        return np.sqrt(d2) - reach
+    so = ri[17]
+    b0 = ri[li + 4 * b + 1]
+    b1 = ri[li + 4 * b + 2]
+    for s in range(b0, b1):
+        _transform(T, fb, rf, so + 4 * s, cb, s - b0)
+    best = _INF
+    wide = rf[bo + 4 * b + 3]
+    bx = T[fb, 0] * rf[bo + 4 * b] + T[fb, 1] * rf[bo + 4 * b + 1] + T[fb, 2] * rf[bo + 4 * b + 2]
+    by = T[fb, 3] * rf[bo + 4 * b] + T[fb, 4] * rf[bo + 4 * b + 1] + T[fb, 5] * rf[bo + 4 * b + 2]
+    bz = T[fb, 6] * rf[bo + 4 * b] + T[fb, 7] * rf[bo + 4 * b + 1] + T[fb, 8] * rf[bo + 4 * b + 2]
+    bx += T[fb, 9]
+    by += T[fb, 10]
+    bz += T[fb, 11]
+    for s in range(ri[li + 4 * a + 1], ri[li + 4 * a + 2]):
+        _transform(T, fa, rf, so + 4 * s, ca, 0)
+        x = ca[0, 0]
+        y = ca[0, 1]
+        z = ca[0, 2]
+        ra = rf[so + 4 * s + 3]
+        far = (x - bx) ** 2 + (y - by) ** 2 + (z - bz) ** 2
+        bound = ra + wide + min(enough, best)
+        if bound > 0.0 and far > bound * bound:
+            best = min(best, np.sqrt(far) - ra - wide)
+            continue
+        for t in range(b0, b1):
+            u = t - b0
+            d2 = (x - cb[u, 0]) ** 2 + (y - cb[u, 1]) ** 2 + (z - cb[u, 2]) ** 2
+            best = min(best, np.sqrt(d2) - ra - rf[so + 4 * t + 3])
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _state_valid(q, rf, ri, D, wf, T, ca, cb):
+    if not within_limits(q, rf, ri):
+        return False
+    fk_frames(q, rf, ri, T)
+    margin = wf[6]
+    li = ri[9]
+    # Distal links first: the hand is what hits things.
+    for link in range(ri[2] - 1, -1, -1):
+        if ri[li + 4 * link + 3] == 0 and not _link_clear(link, T, rf, ri, D, wf, margin, ca):
+            return False
+    self_margin = rf[ri[21]]
+    for pair in range(ri[3]):
+        if not _pair_gap(pair, T, rf, ri, self_margin, ca, cb) > self_margin:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def is_valid(q, rf, ri, D, wf):
+    """Whether a configuration is inside its limits and clear of the world and itself."""
+    most = ri[5]
+    return _state_valid(
+        q, rf, ri, D, wf, np.empty((ri[0], 12)), np.empty((1, 3)), np.empty((most, 3))
+    )
+
+
+@njit(cache=True, nogil=True)
+def is_valid_batch(Q, rf, ri, D, wf, out):
+    """Fill out (n,) with `is_valid` of each row of Q (n, dof)."""
+    T = np.empty((ri[0], 12))
+    ca = np.empty((1, 3))
+    cb = np.empty((ri[5], 3))
+    for n in range(Q.shape[0]):
+        out[n] = _state_valid(Q[n], rf, ri, D, wf, T, ca, cb)
+
+
+@njit(cache=True, nogil=True)
+def clearance_batch(Q, rf, ri, D, wf, world, own):
+    """Fill world (n,) and own (n,): distance bounds to the world and between links, metres."""
+    T = np.empty((ri[0], 12))
+    ca = np.empty((1, 3))
+    cb = np.empty((ri[5], 3))
+    li = ri[9]
+    for n in range(Q.shape[0]):
+        fk_frames(Q[n], rf, ri, T)
+        best = _INF
+        for link in range(ri[2]):
+            if ri[li + 4 * link + 3] == 0:
+                best = min(best, _link_clearance(link, T, rf, ri, D, wf, best, ca))
+        world[n] = best
+        gap = _INF
+        for pair in range(ri[3]):
+            gap = min(gap, _pair_gap(pair, T, rf, ri, gap, ca, cb))
+        own[n] = gap
+
+
+@njit(cache=True, nogil=True)
+def sphere_clearances(q, rf, ri, D, wf, centers, plane, which, field):
+    """Per sphere: centre, distance to the nearest plane and its index, bound from the field.
+
+    Every sphere's own values (no bounding spheres): what `explain` reports.
+    """
+    place_spheres(q, rf, ri, centers)
+    so = ri[17]
+    for s in range(ri[1]):
+        x = centers[s, 0]
+        y = centers[s, 1]
+        z = centers[s, 2]
+        r = rf[so + 4 * s + 3]
+        plane[s] = _INF
+        which[s] = -1
+        for p in range(int(wf[5])):
+            o = 7 + 4 * p
+            d = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3] - r
+            if d < plane[s]:
+                plane[s] = d
+                which[s] = p
+        field[s] = field_bound(D, wf, x, y, z, _INF) - r
+
+
+@njit(cache=True, nogil=True)
+def pair_gaps(q, rf, ri, gaps, spheres):
+    """Fill gaps (n_pairs,) with the smallest sphere gap of each link pair, metres, and
+    spheres (n_pairs, 2) with the two spheres that have it."""
+    centers = np.empty((ri[1], 3))
+    place_spheres(q, rf, ri, centers)
+    li = ri[9]
+    so = ri[17]
+    for pair in range(ri[3]):
+        a = ri[ri[10] + 2 * pair]
+        b = ri[ri[10] + 2 * pair + 1]
+        gaps[pair] = _INF
+        for s in range(ri[li + 4 * a + 1], ri[li + 4 * a + 2]):
+            for t in range(ri[li + 4 * b + 1], ri[li + 4 * b + 2]):
+                d2 = 0.0
+                for k in range(3):
+                    d2 += (centers[s, k] - centers[t, k]) ** 2
+                gap = np.sqrt(d2) - rf[so + 4 * s + 3] - rf[so + 4 * t + 3]
+                if gap < gaps[pair]:
+                    gaps[pair] = gap
+                    spheres[pair, 0] = s
+                    spheres[pair, 1] = t
+
+
+@njit(cache=True, nogil=True)
+def motion_rates(delta, rf, ri, link_rate, pair_rate):
+    """Bounds on motion per unit of path parameter; return the largest of them.
+
+    link_rate[l]: displacement of any sphere centre of link l in the world.
+    pair_rate[p]: change of the distance between two links, to which only the joints
+    between them contribute.
+    """
+    n_frames = ri[0]
+    n_links = ri[2]
+    fi = ri[8]
+    ff = ri[16]
+    ro = ri[20]
+    speed = np.zeros(n_frames)
+    for f in range(1, n_frames):
+        speed[f] = abs(rf[ff + 14 * f + 12] * delta[ri[fi + 3 * f + 2]])
+    fastest = 0.0
+    for link in range(n_links):
+        rate = 0.0
+        for f in range(1, n_frames):
+            rate += speed[f] * max(rf[ro + f * n_links + link], 0.0)
+        link_rate[link] = rate
+        fastest = max(fastest, rate)
+    for pair in range(ri[3]):
+        a = ri[ri[10] + 2 * pair]
+        b = ri[ri[10] + 2 * pair + 1]
+        rate = 0.0
+        for f in range(1, n_frames):
+            reach_a = rf[ro + f * n_links + a]  # -1 where the joint does not move the link
+            reach_b = rf[ro + f * n_links + b]
+            if (reach_a >= 0.0) != (reach_b >= 0.0):
+                rate += speed[f] * max(reach_a, reach_b)
+        pair_rate[pair] = rate
+        fastest = max(fastest, rate)
+    return fastest
+
+
+@njit(cache=True, nogil=True)
+def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, ca, cb):
+    """How far along the edge (path parameter) a configuration's clearance reaches; < 0: invalid.
+
+    Each link may move by its clearance, each pair by its gap, before anything can
+    touch; spans beyond `longest` are not worth refining.
+    """
+    if not within_limits(q, rf, ri):
+        return -1.0
+    fk_frames(q, rf, ri, T)
+    margin = wf[6]
+    li = ri[9]
+    span = longest
+    for link in range(ri[2] - 1, -1, -1):
+        if ri[li + 4 * link + 3] != 0:
+            continue
+        rate = link_rate[link]
+        c = _link_clearance(link, T, rf, ri, D, wf, margin + span * rate, ca) - margin
+        if not c > 0.0:
+            return -1.0
+        if c < span * rate:
+            span = c / rate
+    self_margin = rf[ri[21]]
+    for pair in range(ri[3]):
+        rate = pair_rate[pair]
+        g = _pair_gap(pair, T, rf, ri, self_margin + span * rate, ca, cb) - self_margin
+        if not g > 0.0:
+            return -1.0
+        if g < span * rate:
+            span = g / rate
+    return span
+
+
+@njit(cache=True, nogil=True)
+def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
+    """Whether the straight edge qa -> qb is free, by conservative advancement.
+
+    Intervals between checked configurations are covered by what their clearances
+    guarantee; the middle of what is left is checked next. A gap in which no sphere
+    can move more than `min_motion` metres is accepted: any point of it lies within
+    min_motion / 2 of a configuration known to be free.
+
+    stats (4,): path parameter of a collision (or -1), configurations checked,
+    largest motion of an accepted gap (metres; 0 = certified throughout), motion bound.
+    """
+    dof = ri[4]
+    co = ri[11]
+    delta = np.empty(dof)
+    for j in range(dof):
+        d = qb[j] - qa[j]
+        if ri[co + j] != 0 and np.isfinite(d):
+            d -= 2.0 * np.pi * np.round(d / (2.0 * np.pi))
+        delta[j] = d
+    stats[0] = -1.0
+    stats[1] = 0.0
+    stats[2] = 0.0
+    stats[3] = 0.0
+    if not within_limits(qa, rf, ri):
+        stats[0] = 0.0
+        return False
+    if not within_limits(qb, rf, ri):
+        stats[0] = 1.0
+        return False
+    link_rate = np.empty(ri[2])
+    pair_rate = np.empty(ri[3])
+    total = motion_rates(delta, rf, ri, link_rate, pair_rate)
+    stats[3] = total
+    T = np.empty((ri[0], 12))
+    ca = np.empty((1, 3))
+    cb = np.empty((ri[5], 3))
+    q = np.empty(dof)
+    lo = np.empty(128)
+    hi = np.empty(128)
+    span_a = _safe_span(qa, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, ca, cb)
+    stats[1] = 1.0
+    if span_a < 0.0:
+        stats[0] = 0.0
+        return False
+    span_b = _safe_span(qb, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, ca, cb)
+    stats[1] = 2.0
+    if span_b < 0.0:
+        stats[0] = 1.0
+        return False
+    lo[0] = span_a
+    hi[0] = 1.0 - span_b
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        a = lo[depth]
+        b = hi[depth]
+        gap = (b - a) * total
+        if gap <= min_motion:
+            stats[2] = max(stats[2], gap)
+            continue
+        t = 0.5 * (a + b)
+        for j in range(dof):
+            q[j] = qa[j] + t * delta[j]
+        span = _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, 0.5 * (b - a), T, ca, cb)
+        stats[1] += 1.0
+        if span < 0.0:
+            stats[0] = t
+            return False
+        # Each interval is at most half its parent, so the stack stays below 2 * 60.
+        lo[depth] = a
+        hi[depth] = t - span
+        lo[depth + 1] = t + span
+        hi[depth + 1] = b
+        depth += 2
+    return True

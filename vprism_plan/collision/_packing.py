@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Packs a robot and a world into the few flat arrays the checking kernels read.
+
+Besides copying, this turns every joint frame so that its axis is z (a rotation about a
+coordinate axis costs half of a general one) and bounds how far each joint can carry
+each link, which is what the continuous edge check advances by.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.collision.protocols import BakedWorld
+from vprism_plan.errors import RobotError
+from vprism_plan.robots import KinematicArrays
+
+_HEADER = 24
+
+
+@dataclass(frozen=True)
+class PackedRobot:
+    """Kernel view of a robot; the layout is documented in `vprism_plan._kernels.checking`."""
+
+    floats: Float[np.ndarray, "f"]
+    ints: Int[np.ndarray, "i"]
+
+
+@dataclass(frozen=True)
+class PackedWorld:
+    """Kernel view of a world: node distances (metres, float32) and grid, plane, margin data."""
+
+    distance: Float[np.ndarray, "nx ny nz"]
+    floats: Float[np.ndarray, "w"]
+
+
+def _rotation_from_z(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return a rotation whose third column is the unit vector `axis`."""
+    helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    x = np.cross(helper, axis)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(axis, x), axis])
+
+
+def _ancestors(parent: Int[np.ndarray, "f"]) -> list[list[int]]:
+    """Return, for each frame, the chain from the base to the frame itself."""
+    chains: list[list[int]] = []
+    for frame, above in enumerate(parent):
+        chains.append([*chains[above], frame] if above >= 0 else [frame])
+    return chains
+
+
+def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
+    """Return the largest displacement of a prismatic frame within its limits, metres."""
+    if arrays.kind[frame] != 2:
+        return 0.0
+    joint = int(arrays.q_index[frame])
+    ends = arrays.q_mult[frame] * np.array([arrays.lower[joint], arrays.upper[joint]])
+    return float(np.max(np.abs(ends + arrays.q_offset[frame])))
+
+
+def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
+    """Bound the distance between each joint's axis and each link's sphere centres.
+
+    Entry (f, l) is an upper bound, over all configurations within the limits, on how
+    far joint f can move any sphere centre of link l per unit of its own motion
+    (metres per radian; 1 for prismatic joints); -1 where f does not move l. Offsets
+    along the chain are added up, which is the triangle inequality.
+    """
+    n_links = len(arrays.link_frame)
+    table = np.full((len(arrays.parent), n_links), -1.0)
+    chains = _ancestors(arrays.parent)
+    for link in range(n_links):
+        chain = chains[int(arrays.link_frame[link])]
+        rows = slice(int(arrays.link_start[link]), int(arrays.link_start[link + 1]))
+        centers = arrays.sphere_center[rows]
+        # reach: from the origin of the frame below to the farthest sphere centre
+        reach = float(np.max(np.linalg.norm(centers, axis=1)))
+        for position in range(len(chain) - 1, 0, -1):
+            frame = chain[position]
+            axis = arrays.axis[frame]
+            if position == len(chain) - 1:
+                lever = float(np.max(np.linalg.norm(np.cross(centers, axis), axis=1)))
+            else:
+                below = chain[position + 1]
+                across = float(np.linalg.norm(np.cross(arrays.t_off[below], axis)))
+                lever = across + _prismatic_travel(arrays, below) + reach
+                reach += float(np.linalg.norm(arrays.t_off[below]))
+                reach += _prismatic_travel(arrays, below)
+            table[frame, link] = 1.0 if arrays.kind[frame] == 2 else lever
+    return table
+
+
+def _frame_floats(arrays: KinematicArrays) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return (frames, 14) pose and motion data and each frame's rotation to a z axis."""
+    n_frames = len(arrays.parent)
+    frames = np.zeros((n_frames, 14))
+    turned = [np.eye(3)]
+    frames[0, :9] = arrays.base_R.reshape(-1)
+    frames[0, 9:12] = arrays.base_t
+    for f in range(1, n_frames):
+        above = turned[int(arrays.parent[f])]
+        turn = _rotation_from_z(arrays.axis[f])
+        turned.append(turn)
+        frames[f, :9] = (above.T @ arrays.R_off[f] @ turn).reshape(-1)
+        frames[f, 9:12] = above.T @ arrays.t_off[f]
+        frames[f, 12] = arrays.q_mult[f]
+        frames[f, 13] = arrays.q_offset[f]
+    return frames, turned
+
+
+def pack_robot(arrays: KinematicArrays, self_margin: float = 0.0) -> PackedRobot:
+    """Pack a robot's kinematics, spheres and pairs for the kernels.
+
+    Args:
+        arrays: Flat description of the robot.
+        self_margin: Gap, metres, that link pairs must keep beyond touching.
+
+    Raises:
+        RobotError: A prismatic joint has no finite limits, so its motion has no bound.
+    """
+    prismatic = np.flatnonzero(arrays.kind == 2)
+    for frame in prismatic:
+        if not np.isfinite(_prismatic_travel(arrays, int(frame))):
+            raise RobotError(
+                f"prismatic joint number {int(arrays.q_index[frame])} has infinite limits; "
+                "give it finite limits in the URDF, or lock it"
+            )
+    followers = np.flatnonzero((arrays.q_mult != np.round(arrays.q_mult)) & (arrays.kind == 1))
+    for frame in followers:
+        if arrays.continuous[arrays.q_index[frame]]:
+            raise RobotError(
+                f"a joint follows continuous joint number {int(arrays.q_index[frame])} with "
+                f"multiplier {arrays.q_mult[frame]}, so a full turn does not come back to the "
+                "same state; make the followed joint revolute, with limits"
+            )
+    frames, turned = _frame_floats(arrays)
+    n_frames, n_links = len(arrays.parent), len(arrays.link_frame)
+    spheres = np.empty((len(arrays.sphere_radius), 4))
+    for s, frame in enumerate(arrays.sphere_frame):
+        spheres[s, :3] = turned[int(frame)].T @ arrays.sphere_center[s]
+    spheres[:, 3] = arrays.sphere_radius
+    bounding = np.empty((n_links, 4))
+    for link, frame in enumerate(arrays.link_frame):
+        bounding[link, :3] = turned[int(frame)].T @ arrays.link_center[link]
+    bounding[:, 3] = arrays.link_radius
+    limits = np.column_stack([arrays.lower, arrays.upper])
+    float_parts = [frames, spheres, bounding, limits, reach_table(arrays), np.array([self_margin])]
+    frame_ints = np.column_stack([arrays.parent, arrays.kind, np.maximum(arrays.q_index, 0)])
+    starts, ends = arrays.link_start[:-1], arrays.link_start[1:]
+    link_ints = np.column_stack([arrays.link_frame, starts, ends, arrays.link_fixed.astype(int)])
+    int_parts = [frame_ints, link_ints, arrays.pairs, arrays.continuous.astype(np.int64)]
+    header = np.zeros(_HEADER, dtype=np.int64)
+    header[:6] = (
+        n_frames,
+        len(spheres),
+        n_links,
+        len(arrays.pairs),
+        len(arrays.lower),
+        max(1, int(np.max(ends - starts))),
+    )
+    header[8:12] = _HEADER + np.cumsum([0, *[part.size for part in int_parts[:-1]]])
+    header[16:22] = np.cumsum([0, *[part.size for part in float_parts[:-1]]])
+    floats = np.concatenate(
+        [np.asarray(part, dtype=np.float64).reshape(-1) for part in float_parts]
+    )
+    ints = np.concatenate([header, *[np.asarray(p, dtype=np.int64).reshape(-1) for p in int_parts]])
+    return PackedRobot(floats=floats, ints=ints)
+
+
+def pack_world(world: BakedWorld, margin: float) -> PackedWorld:
+    """Pack a baked world for the kernels; `margin` (metres) is the clearance to keep."""
+    field = world.field
+    planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
+    outside = 1.0 if world.config.unobserved == "occupied" else 0.0
+    head = [*np.asarray(field.origin, dtype=np.float64), float(field.spacing), outside]
+    floats = np.array([*head, float(len(planes)), float(margin), *planes.reshape(-1)])
+    return PackedWorld(
+        distance=np.ascontiguousarray(field.distance, dtype=np.float32), floats=floats
+    )

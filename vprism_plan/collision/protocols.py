@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a checker needs of a world and of a robot: anything that has it can be checked."""
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vprism_plan.collision.config import CheckerConfig
+from vprism_plan.robots import KinematicArrays
+
+
+@runtime_checkable
+class NodeField(Protocol):
+    """Distances on a grid of nodes; see `vprism_plan.world.DistanceField`."""
+
+    origin: np.ndarray
+    spacing: float
+    distance: np.ndarray
+    source: np.ndarray
+
+
+@runtime_checkable
+class BakedWorld(Protocol):
+    """A world that answers distances; see `vprism_plan.world.World`."""
+
+    @property
+    def field(self) -> NodeField:
+        """Combined field of everything that is not a half-space."""
+        ...
+
+    @property
+    def planes(self) -> np.ndarray:
+        """(P, 4) half-space obstacles {x: n.x < offset}, rows (n, offset), metres."""
+        ...
+
+    @property
+    def plane_names(self) -> tuple[str, ...]:
+        """Name of each half-space; the support surface comes first."""
+        ...
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names that `field.source` indexes."""
+        ...
+
+    @property
+    def config(self) -> Any:
+        """Policies: `.occluded` and `.unobserved`."""
+        ...
+
+    @property
+    def map(self) -> Any:
+        """The map, for `occupancy(points)`."""
+        ...
+
+    def status(self, points: np.ndarray) -> np.ndarray:
+        """(N,) codes: 0 seen, 1 occluded, 2 unobserved, 3 outside the grid."""
+        ...
+
+
+@runtime_checkable
+class SphereRobot(Protocol):
+    """A robot made of spheres; see `vprism_plan.robots.Robot`."""
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        ...
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints of a configuration, in order."""
+        ...
+
+    @property
+    def dof(self) -> int:
+        """Length of a configuration."""
+        ...
+
+    @property
+    def arrays(self) -> KinematicArrays:
+        """Flat description for the kernels."""
+        ...
+
+    @property
+    def lower(self) -> np.ndarray:
+        """(dof,) lower limits, radians or metres."""
+        ...
+
+    @property
+    def upper(self) -> np.ndarray:
+        """(dof,) upper limits, radians or metres."""
+        ...
+
+    @property
+    def continuous(self) -> np.ndarray:
+        """(dof,) bool: joints that wrap."""
+        ...
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Links that have spheres."""
+        ...
+
+    @property
+    def sphere_links(self) -> np.ndarray:
+        """(S,) index into `link_names`."""
+        ...
+
+    @property
+    def sphere_radii(self) -> np.ndarray:
+        """(S,) metres."""
+        ...
+
+    @property
+    def collision_pairs(self) -> np.ndarray:
+        """(P, 2) links to be checked against each other."""
+        ...
+
+
+@runtime_checkable
+class Answers(Protocol):
+    """What explaining a verdict needs of the checker that gave it."""
+
+    world: BakedWorld
+    robot: SphereRobot
+    config: CheckerConfig
+
+    def is_valid(self, q: ArrayLike) -> bool:
+        """Verdict on a configuration."""
+        ...
+
+    def clearance(self, q: ArrayLike) -> float:
+        """Distance to the world, metres."""
+        ...
+
+    def self_clearance_batch(self, Q: ArrayLike) -> np.ndarray:
+        """(n,) smallest gaps between links, metres."""
+        ...
+
+    def sphere_clearances(
+        self, q: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Centres, plane distances, plane indices and field distances of all spheres."""
+        ...
+
+    def pair_gaps(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gap of each link pair, metres, and the two spheres that have it."""
+        ...

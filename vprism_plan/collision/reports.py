@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Verdicts with reasons. Keys of the dictionaries mirror MoveIt's messages."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Kind = Literal[
+    "object",
+    "support",
+    "background",
+    "occluded",
+    "unobserved",
+    "known",
+    "self",
+    "joint_limit",
+    "not_finite",
+]
+
+# moveit_msgs/ContactInformation body types
+_ROBOT_LINK, _WORLD_OBJECT = 0, 1
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One reason why a configuration is refused.
+
+    Attributes:
+        kind: What the link touches.
+        link: Link that touches (for a joint limit: the joint).
+        body: Name of what is touched: "object:3", "table", "background", "occluded",
+            another link, or the limit.
+        depth: How far the clearance falls short of what is required, metres (for a
+            joint limit: how far outside, radians or metres).
+        sphere: Index of the collision sphere, or -1.
+        position: Point of contact, world frame, metres.
+        normal: Unit direction that leads out of the contact, world frame.
+        probability: Largest P(occupied) of the map inside the sphere; None where the
+            cause is not the map's to judge (self, limits, known geometry).
+        detail: The rule that decided, in words.
+    """
+
+    kind: Kind
+    link: str
+    body: str
+    depth: float
+    sphere: int = -1
+    position: tuple[float, float, float] | None = None
+    normal: tuple[float, float, float] | None = None
+    probability: float | None = None
+    detail: str = ""
+
+    def text(self) -> str:
+        """Return the reason as one phrase."""
+        if self.kind in {"joint_limit", "not_finite"}:
+            return self.detail
+        at = ""
+        if self.position is not None:
+            at = " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
+        sure = "" if self.probability is None else f", P(occupied) {self.probability:.2f}"
+        why = f" ({self.detail})" if self.detail else ""
+        return f"{self.link} is {1000 * self.depth:.1f} mm into {self.body}{at}{sure}{why}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready keys of moveit_msgs/ContactInformation, and ours."""
+        return {
+            "contact_body_1": self.link,
+            "body_type_1": _ROBOT_LINK,
+            "contact_body_2": self.body,
+            "body_type_2": _ROBOT_LINK if self.kind == "self" else _WORLD_OBJECT,
+            "position": self.position,
+            "normal": self.normal,
+            "depth": self.depth,
+            "kind": self.kind,
+            "sphere": self.sphere,
+            "probability": self.probability,
+            "detail": self.detail,
+        }
+
+
+@dataclass(frozen=True)
+class StateReport:
+    """Why a configuration is accepted or refused.
+
+    Attributes:
+        valid: The verdict; `contacts` is never empty when it is False.
+        contacts: Reasons, deepest first, one per link and touched body.
+        clearance: Lower bound of the distance to the world, metres; nan if q is not finite.
+        self_clearance: Smallest gap between links that may collide, metres; inf if none.
+        margin: Clearance that was required, metres.
+        shares: Share of the robot's sphere volume that lies in space that is "occluded",
+            "unobserved" or "outside" the grid: what nobody has seen.
+        policies: What the world does with those spaces ("occupied", "free", "posterior").
+    """
+
+    valid: bool
+    contacts: tuple[Contact, ...]
+    clearance: float
+    self_clearance: float
+    margin: float
+    shares: dict[str, float] = field(default_factory=dict)
+    policies: dict[str, str] = field(default_factory=dict)
+
+    def text(self) -> str:
+        """Return the verdict in one line."""
+        if self.valid:
+            unseen = ", ".join(f"{k} {100 * v:.0f}%" for k, v in self.shares.items() if v > 0.005)
+            return f"free, clearance {1000 * self.clearance:.1f} mm" + (
+                f"; volume not seen: {unseen}" if unseen else ""
+            )
+        return "; ".join(contact.text() for contact in self.contacts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready keys of moveit_msgs/GetStateValidity (valid, contacts,
+        cost_sources), and ours. A cost source's cost is the map's P(occupied)."""
+        return {
+            "valid": self.valid,
+            "contacts": [contact.to_dict() for contact in self.contacts],
+            "cost_sources": [
+                {"cost_density": c.probability, "aabb_center": c.position, "contact_body": c.body}
+                for c in self.contacts
+                if c.probability is not None
+            ],
+            "clearance": self.clearance,
+            "self_clearance": self.self_clearance,
+            "margin": self.margin,
+            "shares": dict(self.shares),
+            "policies": dict(self.policies),
+        }
+
+
+@dataclass(frozen=True)
+class MotionReport:
+    """Why an edge is accepted or refused.
+
+    Attributes:
+        valid: The verdict.
+        certified: Every point of the edge is covered by a computed clearance, so
+            nothing was left to sampling. False for a refused edge.
+        tolerance: Largest motion, metres, between any point of the edge and a
+            configuration known to be free (0 when certified).
+        collision_fraction: Where along the edge the collision that refused it was
+            found, 0 to 1; None when valid. Not necessarily the first one.
+        configurations: How many configurations were checked.
+        motion_bound: Upper bound of any sphere's path length along the edge, metres.
+        state: Report of the refused configuration; None when valid.
+    """
+
+    valid: bool
+    certified: bool
+    tolerance: float
+    collision_fraction: float | None
+    configurations: int
+    motion_bound: float
+    state: StateReport | None = None
+
+    def text(self) -> str:
+        """Return the verdict in one line."""
+        if self.valid:
+            how = "certified" if self.certified else f"to within {1000 * self.tolerance:.2f} mm"
+            return f"free ({how}, {self.configurations} configurations)"
+        reason = "" if self.state is None else f": {self.state.text()}"
+        return f"in collision at {self.collision_fraction:.3f} of the edge{reason}"
