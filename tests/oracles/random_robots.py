@@ -1,5 +1,6 @@
 """Random kinematic trees: any axis, prismatic and mimic joints, branches, many spheres."""
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -34,11 +35,11 @@ def random_arrays(rng: np.random.Generator, dof: int = 4, reach: float = 0.6) ->
     start = np.concatenate([[0], np.cumsum(counts)])
     centers = rng.normal(scale=0.05, size=(start[-1], 3))
     radii = rng.uniform(0.01, 0.06, start[-1])
-    link_center = np.array([centers[a:b].mean(axis=0) for a, b in zip(start, start[1:])])
+    link_center = np.array([centers[a:b].mean(axis=0) for a, b in pairwise(start)])
     link_radius = np.array(
         [
             np.max(np.linalg.norm(centers[a:b] - c, axis=1) + radii[a:b])
-            for a, b, c in zip(start, start[1:], link_center)
+            for (a, b), c in zip(pairwise(start), link_center, strict=True)
         ]
     )
     pairs = [(a, b) for a in range(len(links)) for b in range(a + 1, len(links))]
