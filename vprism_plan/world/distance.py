@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Distance to the obstacles on a grid of nodes, and bounds between the nodes."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int16, Int32, UInt8
+
+from vprism_plan._kernels import world as kernels
+from vprism_plan._threads import run_chunked
+from vprism_plan.errors import WorldError
+from vprism_plan.world.grid import Grid
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Marked nodes of a lattice finer than the grid: where obstacles are.
+
+    Attributes:
+        labels: (X, Y, Z) uint8, 0 = not an obstacle. Obstacles are unions of cells, and
+            all corners of such a cell are marked; the point of a cell nearest to any
+            lattice node is one of its corners, so distances to marked nodes are exactly
+            the distances to the cells.
+        corner: (3,) position of labels[0, 0, 0] in lattice steps from the world origin.
+        factor: lattice steps per grid step.
+    """
+
+    labels: UInt8[np.ndarray, "x y z"]
+    corner: Int[np.ndarray, " 3"]
+    factor: int
+
+
+def distance_to_lattice(
+    lattice: Lattice, grid: Grid
+) -> tuple[Float32[np.ndarray, "nx ny nz"], UInt8[np.ndarray, "nx ny nz"]]:
+    """Exact distance (metres, rounded down) from every node to the marked cells, and their label.
+
+    Infinite, with label 0, if nothing is marked.
+    """
+    first = [int(v) for v in grid.first * lattice.factor - lattice.corner]
+    nx, ny, nz = grid.shape
+    X, Y, _ = lattice.labels.shape
+    step = lattice.factor
+    labels = np.ascontiguousarray(lattice.labels)
+    d_z, l_z = np.empty((X, Y, nz), np.int32), np.empty((X, Y, nz), np.uint8)
+    run_chunked(
+        lambda s: kernels.edt_pass_z(labels, first[2], step, d_z, l_z, s.start, s.stop), X, 16
+    )
+    d_y, l_y = np.empty((X, ny, nz), np.int32), np.empty((X, ny, nz), np.uint8)
+    run_chunked(
+        lambda s: kernels.edt_pass_y(d_z, l_z, first[1], step, d_y, l_y, s.start, s.stop), X, 16
+    )
+    squares, nearest = np.empty((nx, ny, nz), np.int32), np.empty((nx, ny, nz), np.uint8)
+    run_chunked(
+        lambda s: kernels.edt_pass_x(d_y, l_y, first[0], step, squares, nearest, s.start, s.stop),
+        ny,
+        8,
+    )
+    return _metres(squares, grid.spacing / step), nearest
+
+
+def _metres(squares: Int32[np.ndarray, "x y z"], spacing: float) -> Float32[np.ndarray, "x y z"]:
+    """Squared distances in lattice steps to metres; FAR means that there is nothing."""
+    distance = round_down(spacing * np.sqrt(squares.astype(np.float64)))
+    distance[squares >= kernels.FAR] = np.inf
+    return distance
+
+
+def round_down(values: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
+    """Nearest float32 that is not above the value: a lower bound stays one."""
+    single = values.astype(np.float32)
+    above = single > values
+    single[above] = np.nextafter(single[above], np.float32(-np.inf))
+    return single
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceField:
+    """Lower bounds of the signed distance to a set of obstacles, at the nodes of a grid.
+
+    All obstacles lie inside the grid's box (if `solid_outside`, everything outside
+    of the box is an obstacle too).
+
+    Attributes:
+        origin: (3,) world position of node (0, 0, 0), metres.
+        spacing: between nodes, metres.
+        distance: (nx, ny, nz) float32 metres, rounded down. Outside the obstacles the
+            exact distance to the cells that cover them; inside, at most the negative
+            distance to the nearest point outside.
+        source: (nx, ny, nz) int16, index into `sources` of the nearest obstacle; -1
+            everywhere if there is none.
+        sources: names of the obstacles.
+        solid_outside: whether space outside the grid is an obstacle.
+    """
+
+    origin: Float[np.ndarray, " 3"]
+    spacing: float
+    distance: Float32[np.ndarray, "nx ny nz"]
+    source: Int16[np.ndarray, "nx ny nz"]
+    sources: tuple[str, ...]
+    solid_outside: bool = False
+    _tensors: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def upper(self) -> Float[np.ndarray, " 3"]:
+        """World position of the last node, metres."""
+        return self.origin + self.spacing * (np.array(self.distance.shape) - 1)
+
+    def lower_bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Lower bound of the signed distance from world points to the obstacles, metres.
+
+        Never above the true distance. Between nodes it uses that the squared distance
+        less |x|^2 is concave, d(x)^2 >= sum_i w_i d_i^2 - sum_i w_i |x - x_i|^2 with the
+        trilinear weights w_i, and near or inside obstacles that the signed distance
+        changes by at most the way travelled, d(x) >= max_i d_i - |x - x_i|.
+
+        Raises:
+            WorldError: a point is not finite.
+        """
+        points = checked_points(points)
+        out = np.empty(len(points))
+        run_chunked(
+            lambda s: kernels.lower_bounds(
+                points,
+                self.origin,
+                self.spacing,
+                self.distance,
+                self.solid_outside,
+                out,
+                s.start,
+                s.stop,
+            ),
+            len(points),
+            1 << 14,
+        )
+        return out
+
+    def source_at(self, points: Float[np.ndarray, "n 3"]) -> Int16[np.ndarray, " n"]:
+        """Index into `sources` of the obstacle nearest to the grid node nearest to each point.
+
+        Raises:
+            WorldError: a point is not finite.
+        """
+        steps = np.rint((checked_points(points) - self.origin) / self.spacing).astype(np.int64)
+        nodes = np.clip(steps, 0, np.array(self.distance.shape) - 1)
+        return self.source[nodes[:, 0], nodes[:, 1], nodes[:, 2]]
+
+    def distance_at(self, points: "torch.Tensor") -> "torch.Tensor":
+        """Trilinear interpolation of the node distances, differentiable; (..., 3) to (...,).
+
+        For gradients, not for verdicts: it may exceed the true distance by up to a
+        voxel. Outside the grid: the distance to the box combined with the distance at
+        its nearest point, as for `lower_bound`.
+        """
+        import torch
+
+        values = self._tensor(points)
+        size = torch.tensor(self.distance.shape, device=points.device)
+        origin = torch.as_tensor(self.origin, dtype=points.dtype, device=points.device)
+        upper = torch.as_tensor(self.upper, dtype=points.dtype, device=points.device)
+        inside = torch.minimum(torch.maximum(points, origin), upper)
+        scaled = (inside - origin) / self.spacing
+        cell = torch.minimum(scaled.detach().floor().long().clamp(min=0), size - 2)
+        fraction = scaled - cell
+        total = torch.zeros_like(points[..., 0])
+        for corner in range(8):
+            bits = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=cell.device)
+            weight = torch.where(bits.bool(), fraction, 1.0 - fraction).prod(dim=-1)
+            node = cell + bits
+            flat = (node[..., 0] * size[1] + node[..., 1]) * size[2] + node[..., 2]
+            total = total + weight * values[flat]
+        away = (points - inside).square().sum(dim=-1)
+        if self.solid_outside:
+            return torch.where(away > 0, -(away + 1e-18).sqrt(), total)
+        beyond = (away + total.clamp(min=0.0).square() + 1e-18).sqrt()
+        return torch.where(away > 0, beyond, total)
+
+    def _tensor(self, points: "torch.Tensor") -> "torch.Tensor":
+        """Node distances on the device and in the precision of the points."""
+        import torch
+
+        key = (points.device, points.dtype)
+        if key not in self._tensors:
+            flat = torch.from_numpy(self.distance.reshape(-1))
+            self._tensors[key] = flat.to(device=points.device, dtype=points.dtype)
+        return self._tensors[key]
+
+
+def checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
+    """Contiguous float64 points (n, 3); WorldError if they are not that, or not finite."""
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise WorldError(f"points have shape {array.shape}; they must be (n, 3), metres")
+    if not np.isfinite(array).all():
+        bad = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise WorldError(f"point {bad} is {array[bad].tolist()}; all points must be finite")
+    return array
+
+
+@dataclass(frozen=True)
+class NodeDistances:
+    """Unsigned distance from every node to one obstacle set, and which part is nearest."""
+
+    distance: Float32[np.ndarray, "nx ny nz"]
+    source: Int16[np.ndarray, "nx ny nz"]
+
+
+def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
+    """Nearest of several obstacle sets; the first one wins a tie."""
+    distance = np.full(grid.shape, np.inf, dtype=np.float32)
+    source = np.full(grid.shape, -1, dtype=np.int16)
+    for part in parts:
+        closer = part.distance < distance
+        np.copyto(distance, part.distance, where=closer)
+        np.copyto(source, part.source, where=closer)
+    return NodeDistances(distance, source)
+
+
+def finish(
+    nodes: NodeDistances, grid: Grid, sources: tuple[str, ...], solid_outside: bool
+) -> DistanceField:
+    """Give nodes inside obstacles their depth and make the field.
+
+    A node at distance 0 is at most as far from open space as from the nearest node
+    with a positive distance.
+    """
+    distance = nodes.distance.copy()
+    inside = distance <= 0.0
+    reach = float(np.linalg.norm(grid.upper - grid.origin)) + grid.spacing
+    if inside.any():
+        box = _bounding(inside, margin=1)
+        part = Grid(
+            grid.spacing,
+            grid.first + np.array([s.start for s in box]),
+            _shape3(inside[box].shape),
+        )
+        # Nodes on the rim of the box are the nearest outside ones only if they are outside.
+        depth, _ = distance_to_lattice(
+            Lattice((~inside[box]).astype(np.uint8), part.first, 1), part
+        )
+        depth[~np.isfinite(depth)] = reach
+        depth = np.nextafter(depth, np.float32(np.inf))
+        distance[box] = np.where(inside[box], -depth, distance[box])
+    # Nothing anywhere: any finite number is a bound, and arithmetic stays finite.
+    distance[np.isinf(distance)] = reach
+    return DistanceField(
+        grid.origin, grid.spacing, np.ascontiguousarray(distance), nodes.source, sources,
+        solid_outside,
+    )  # fmt: skip
+
+
+def _bounding(mask: np.ndarray, margin: int) -> tuple[slice, slice, slice]:
+    """Slices of the box of the true entries, grown by a margin within the array."""
+    slices = []
+    for axis in range(3):
+        others = tuple(a for a in range(3) if a != axis)
+        hits = np.flatnonzero(mask.any(axis=others))
+        slices.append(
+            slice(max(0, int(hits[0]) - margin), min(mask.shape[axis], int(hits[-1]) + 1 + margin))
+        )
+    return slices[0], slices[1], slices[2]
+
+
+def _shape3(shape: tuple[int, ...]) -> tuple[int, int, int]:
+    if len(shape) != 3 or math.prod(shape) == 0:
+        raise WorldError(f"a grid needs three non-empty axes, got shape {shape}")
+    return shape[0], shape[1], shape[2]

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the nodes of a world's distance field lie."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.errors import WorldError
+from vprism_plan.perception import Plane
+from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.known import HalfSpace
+
+_REACH = 0.6  # metres of room around the observed objects
+_UNDER = 0.02  # metres below the support plane
+_HEIGHT = 1.0  # metres above it, at least
+_MAX_NODES = 60_000_000
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes at spacing * (first + (i, j, k)) for 0 <= (i, j, k) < shape.
+
+    The origin is a whole number of steps from the world's origin, so that every finer
+    lattice of the world shares its nodes.
+    """
+
+    spacing: float
+    first: Int[np.ndarray, " 3"]
+    shape: tuple[int, int, int]
+
+    @property
+    def origin(self) -> Float[np.ndarray, " 3"]:
+        """World position of node (0, 0, 0), metres."""
+        return self.spacing * self.first.astype(np.float64)
+
+    @property
+    def upper(self) -> Float[np.ndarray, " 3"]:
+        """World position of the last node, metres."""
+        return self.spacing * (self.first + np.array(self.shape) - 1).astype(np.float64)
+
+    def slab(self, start: int, stop: int) -> Float[np.ndarray, "n 3"]:
+        """World positions of the nodes with start <= i < stop, in memory order."""
+        sizes = (stop - start, *self.shape[1:])
+        nodes = np.moveaxis(np.indices(sizes), 0, -1).reshape(-1, 3)
+        return self.spacing * (nodes + self.first + np.array([start, 0, 0])).astype(np.float64)
+
+
+def is_level(plane: Plane | None) -> bool:
+    """Whether the support plane is horizontal, that is the world's z axis points up."""
+    return plane is not None and float(plane.normal[2]) > 0.99
+
+
+def _default_box(map_: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Box of the observed objects, grown by the room an arm moves in around them."""
+    seen = []
+    for view in map_.views:
+        points, labels = view.points()
+        seen.append(points[labels > 0])
+    points = np.concatenate(seen) if seen else np.empty((0, 3))
+    if len(points) == 0:
+        points = np.stack(map_.support_bounds())
+    lower, upper = points.min(axis=0) - _REACH, points.max(axis=0) + _REACH
+    if is_level(map_.plane):
+        lower[2] = map_.plane.offset - _UNDER
+        upper[2] = max(upper[2], map_.plane.offset + _HEIGHT)
+    return lower, upper
+
+
+def choose_grid(
+    map_: Any,
+    config: WorldConfig,
+    level_box: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None,
+) -> Grid:
+    """Choose the nodes: the wanted bounds, the level set and all known geometry.
+
+    Raises:
+        WorldError: the grid would have too many nodes to be of use.
+    """
+    boxes = [_default_box(map_) if config.bounds is None else np.array(config.bounds)]
+    if level_box is not None:
+        boxes.append(level_box)
+    boxes += [item.box() for item in config.known if not isinstance(item, HalfSpace)]
+    lower = np.min([box[0] for box in boxes], axis=0)
+    upper = np.max([box[1] for box in boxes], axis=0)
+    # Marked cells reach up to one step beyond what they cover.
+    first = np.floor(lower / config.resolution).astype(np.int64) - 1
+    last = np.ceil(upper / config.resolution).astype(np.int64) + 1
+    shape = tuple(int(n) for n in last - first + 1)
+    if math.prod(shape) > _MAX_NODES:
+        size = " x ".join(f"{edge:.2f}" for edge in upper - lower)
+        raise WorldError(
+            f"a grid of {size} m at {config.resolution} m would have {math.prod(shape):,} nodes "
+            f"(at most {_MAX_NODES:,}); use a coarser resolution, smaller bounds, or HalfSpace "
+            "for walls and floors"
+        )
+    return Grid(config.resolution, first, (shape[0], shape[1], shape[2]))

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The set {P(occupied) >= level} of a map, covered by small cells.
+
+An octree over the box in which the map has any support: a cell is dropped when the
+log-odds cannot reach the level in it, kept whole when they cannot fall below it, and
+divided otherwise. On a cell of edge h the log-odds g differ from the trilinear
+interpolation of their corners by at most sum_a h^2/8 max|g_aa|; the second derivatives
+come from the 27 points that dividing the parent evaluates anyway.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.errors import WorldError
+
+# How far the second derivatives may exceed their finite-difference estimate.
+_CURVATURE_SAFETY = 2.0
+# Log-odds: covers the jump where a kernel is cut off, and rounding.
+_SLACK = 1e-3
+_CHUNK = 1 << 16
+
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(27, 3)
+_CHILDREN = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of one size of the octree, and what is known at their corners.
+
+    Attributes:
+        index: (n, 3) lowest corner, in units of the finest lattice spacing.
+        size: edge length in the same units.
+        labels: (n, 2, 2, 2) most probable object (class 1..C) at each corner.
+    """
+
+    index: Int[np.ndarray, "n 3"]
+    size: int
+    labels: Int[np.ndarray, "n 2 2 2"]
+
+
+@dataclass(frozen=True)
+class LevelSet:
+    """A cover of the level set, on a lattice whose node (0, 0, 0) is the world origin.
+
+    Attributes:
+        spacing: of the lattice, metres.
+        inner: cells that lie wholly inside, by size.
+        border: cells of one lattice step in which the level may be reached.
+        evaluations: how many points of the map were evaluated.
+    """
+
+    spacing: float
+    inner: tuple[Cells, ...]
+    border: Cells
+    evaluations: int
+
+    def box(self) -> tuple[Int[np.ndarray, " 3"], Int[np.ndarray, " 3"]] | None:
+        """First and last lattice node of the cover, or None if it is empty."""
+        parts = [cells for cells in (*self.inner, self.border) if len(cells.index)]
+        if not parts:
+            return None
+        lower = np.min([cells.index.min(axis=0) for cells in parts], axis=0)
+        upper = np.max([cells.index.max(axis=0) + cells.size for cells in parts], axis=0)
+        return lower, upper
+
+
+def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+    """log P(occupied) / P(empty) from class probabilities (class 0 is empty)."""
+    empty = np.clip(probabilities[:, 0], 1e-18, 1.0)
+    return np.log(np.clip(probabilities[:, 1:].sum(axis=1), 1e-18, None)) - np.log(empty)
+
+
+def _evaluate(
+    map_: Any, points: Float[np.ndarray, "n 3"], level: float
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Log-odds less those of the level, and the most probable object class, at points."""
+    values = np.empty(len(points))
+    labels = np.empty(len(points), dtype=np.uint8)
+    for start in range(0, len(points), _CHUNK):
+        piece = slice(start, start + _CHUNK)
+        probabilities = np.asarray(map_.predict_proba(points[piece]))
+        values[piece] = log_odds(probabilities)
+        labels[piece] = 1 + np.argmax(probabilities[:, 1:], axis=1)
+    if not np.isfinite(values).all():
+        raise WorldError("the map's probabilities are not finite; refit or reload the map")
+    return values - math.log(level / (1.0 - level)), labels
+
+
+def _unique_nodes(
+    nodes: Int[np.ndarray, "n 27 3"],
+) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, "n 27"]]:
+    """Distinct lattice nodes, and where each given one is among them."""
+    low = nodes.reshape(-1, 3).min(axis=0)
+    extent = nodes.reshape(-1, 3).max(axis=0) - low + 1
+    shifted = nodes - low
+    keys = (shifted[..., 0] * extent[1] + shifted[..., 1]) * extent[2] + shifted[..., 2]
+    unique, inverse = np.unique(keys.reshape(-1), return_inverse=True)
+    rest, z = np.divmod(unique, extent[2])
+    x, y = np.divmod(rest, extent[1])
+    return np.stack([x, y, z], axis=1) + low, inverse.reshape(keys.shape)
+
+
+def _slack(g: Float[np.ndarray, "n 3 3 3"], step: float) -> Float[np.ndarray, " n"]:
+    """How far g may leave the range of a child cell's corners; step in kernel lengths."""
+    curvature = np.zeros(len(g))
+    for axis in (1, 2, 3):
+        second = np.diff(g, n=2, axis=axis)
+        curvature += np.abs(second).reshape(len(g), -1).max(axis=1)
+    flat = g.reshape(len(g), -1)
+    # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
+    change = 0.25 * step**2 * (flat.max(axis=1) - flat.min(axis=1))
+    return _CURVATURE_SAFETY * curvature / 8.0 + change + _SLACK
+
+
+def lattice_refinement(resolution: float, kernel_length: float) -> int:
+    """How many lattice steps a grid step has: 4, or more for a coarse grid; a power of 2."""
+    refinement = 4
+    while resolution / refinement > 0.25 * kernel_length:
+        refinement *= 2
+    return refinement
+
+
+def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
+    """Cover {P(occupied) >= level} with cells of a lattice of the given spacing.
+
+    Args:
+        map_: `predict_proba`, `support_bounds`, `unsupported_occupancy`, `kernel_length`.
+        spacing: of the finest lattice, metres; its node (0, 0, 0) is the world origin.
+        level: probability.
+
+    Raises:
+        WorldError: the map says "occupied" where it has no evidence at all.
+    """
+    if map_.unsupported_occupancy >= level:
+        raise WorldError(
+            f"P(occupied) is {map_.unsupported_occupancy:.3f} where the map has no evidence, at "
+            f"or above level {level:g}: its level set has no end. Raise the level, or fit with "
+            "a lower prior_occupancy"
+        )
+    lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map_.support_bounds())
+    size = 2
+    while 2 * size * spacing <= 2 * 0.9 * map_.kernel_length:
+        size *= 2
+    first = np.floor(lower / (spacing * size)).astype(np.int64)
+    last = np.ceil(upper / (spacing * size)).astype(np.int64)
+    axes = [np.arange(a, b) * size for a, b in zip(first, last, strict=True)]
+    index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    inner: list[Cells] = []
+    evaluations = 0
+    while True:
+        nodes, where = _unique_nodes(index[:, None, :] + _OFFSETS * (size // 2))
+        values, labels = _evaluate(map_, nodes * spacing, level)
+        evaluations += len(nodes)
+        step = spacing * (size // 2) / map_.kernel_length
+        inside, border = _divide(
+            index, size // 2, values[where], labels[where], step, keep_border=size == 2
+        )
+        size //= 2
+        inner.append(inside)
+        index = border.index
+        if size == 1 or len(index) == 0:
+            break
+    empty = np.empty((0, 2, 2, 2), dtype=np.uint8)
+    if size != 1:
+        border = Cells(np.empty((0, 3), dtype=np.int64), 1, empty)
+    return LevelSet(spacing, tuple(inner), border, evaluations)
+
+
+def _divide(
+    index: Int[np.ndarray, "n 3"],
+    size: int,
+    values: Float[np.ndarray, "n 27"],
+    labels: Int[np.ndarray, "n 27"],
+    step: float,
+    keep_border: bool,
+) -> tuple[Cells, Cells]:
+    """Sort the children (edge `size`) of cells into those inside and those to divide.
+
+    Children with more than one object are divided too, unless they are the last.
+    """
+    g = values.reshape(-1, 3, 3, 3)
+    label = labels.reshape(-1, 3, 3, 3)
+    slack = _slack(g, step)
+    kept: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []), ([], [])]
+    for child in _CHILDREN:
+        block = (slice(None), *(slice(c, c + 2) for c in child))
+        corners = g[block].reshape(len(g), -1)
+        child_label = label[block]
+        flat = child_label.reshape(len(g), -1)
+        reached = corners.max(axis=1) + slack >= 0.0
+        whole = (corners.min(axis=1) - slack >= 0.0) & (flat == flat[:, :1]).all(axis=1)
+        if keep_border:
+            whole[:] = False
+        for (indices, owners), chosen in zip(kept, (whole, reached & ~whole), strict=True):
+            indices.append(index[chosen] + child * size)
+            owners.append(child_label[chosen])
+    inside, border = (
+        Cells(np.concatenate(indices), size, np.concatenate(owners)) for indices, owners in kept
+    )
+    return inside, border

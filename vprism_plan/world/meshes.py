@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Surfaces of the map's objects by marching cubes."""
+
+import logging
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.errors import ConfigError
+from vprism_plan.world.config import check_level
+
+if TYPE_CHECKING:
+    import trimesh
+
+_log = logging.getLogger(__name__)
+
+_CHUNK = 1 << 16
+_MAX_NODES = 60_000_000
+
+
+def extract_meshes(
+    map: Any, level: float = 0.5, resolution: float = 0.01
+) -> "dict[int, trimesh.Trimesh]":
+    """Closed surface of every object, world frame, metres.
+
+    Object k is {x : P(occupied) >= level and k is the most probable object}, so objects
+    do not overlap. Surfaces are watertight, with outward normals (positive volume). An
+    object that reaches the level nowhere on the grid is left out, with a warning.
+
+    Args:
+        map: a `VPrismMap`.
+        level: probability in (0, 1).
+        resolution: edge of the marching cubes, metres.
+
+    Raises:
+        ConfigError: level or resolution is out of range.
+    """
+    probabilities, origin = _sample(map, level, resolution)
+    occupied = probabilities[..., 1:].sum(axis=-1) - level
+    meshes = {}
+    for k, object_id in enumerate(map.object_ids, start=1):
+        inside = occupied
+        if len(map.object_ids) > 1:
+            others = np.delete(probabilities, (0, k), axis=-1).max(axis=-1)
+            inside = np.minimum(occupied, probabilities[..., k] - others)
+        mesh = _surface(inside, origin, resolution)
+        if mesh is None:
+            _log.warning(
+                "object %d has no surface at level %g on a grid of %g m: left out",
+                object_id,
+                level,
+                resolution,
+            )
+            continue
+        meshes[object_id] = mesh
+    return meshes
+
+
+def extract_union_mesh(
+    map: Any, level: float = 0.5, resolution: float = 0.01
+) -> "trimesh.Trimesh | None":
+    """Closed surface of all objects together, {x : P(occupied) >= level}; None if empty.
+
+    Arguments, guarantees and errors as for `extract_meshes`.
+    """
+    probabilities, origin = _sample(map, level, resolution)
+    mesh = _surface(probabilities[..., 1:].sum(axis=-1) - level, origin, resolution)
+    if mesh is None:
+        _log.warning("no object reaches level %g on a grid of %g m", level, resolution)
+    return mesh
+
+
+def _sample(
+    map_: Any, level: float, resolution: float
+) -> tuple[Float[np.ndarray, "nx ny nz k"], Float[np.ndarray, " 3"]]:
+    """Class probabilities on a grid over the map's support, with an empty layer round it."""
+    check_level(level)
+    if not 1e-4 <= resolution <= 1.0:
+        raise ConfigError(f"resolution is {resolution}; it must be between 0.0001 and 1 metres")
+    lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map_.support_bounds())
+    first = np.floor(lower / resolution).astype(np.int64) - 1
+    shape = np.ceil(upper / resolution).astype(np.int64) + 2 - first
+    count = math.prod(int(n) for n in shape)
+    if count > _MAX_NODES:
+        raise ConfigError(
+            f"resolution {resolution} m gives {count:,} samples (at most {_MAX_NODES:,}); "
+            "use a coarser one"
+        )
+    probabilities = np.zeros((count, map_.n_classes), dtype=np.float32)
+    probabilities[:, 0] = 1.0
+    nodes = np.moveaxis(np.indices(tuple(shape)), 0, -1).reshape(-1, 3)
+    inner = np.flatnonzero(((nodes > 0) & (nodes < shape - 1)).all(axis=1))
+    for start in range(0, count, _CHUNK):
+        chosen = inner[start : start + _CHUNK]
+        if len(chosen):
+            points = resolution * (nodes[chosen] + first).astype(np.float64)
+            probabilities[chosen] = map_.predict_proba(points)
+    return probabilities.reshape(*shape, -1), resolution * first
+
+
+def _surface(
+    inside: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, " 3"], resolution: float
+) -> "trimesh.Trimesh | None":
+    """Surface {inside = 0} around {inside > 0}; None if there is none."""
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    if not (inside > 0).any():
+        return None
+    # A value of exactly 0 at a node makes triangles without area.
+    values = np.where(inside == 0, -1e-7, inside).astype(np.float32)
+    vertices, faces, _, _ = marching_cubes(
+        values,
+        0.0,
+        spacing=(resolution,) * 3,
+        gradient_direction="ascent",
+        allow_degenerate=False,
+    )
+    return trimesh.Trimesh(vertices + origin, faces, process=True)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the cameras saw, what they could not see, and where they did not look.
+
+A cell counts as seen only if one view sees all of it: every pixel that its image
+touches has a return, and the nearest of them lies no more than the tolerance in front
+of the cell's far side. So shadows are never too small, whatever the cell's size.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from vprism_plan._kernels import world as kernels
+from vprism_plan._threads import run_chunked
+from vprism_plan.perception import Observation, Plane
+
+SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
+_BLOCK = 8
+
+
+def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
+
+    Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise" (3DIMPVT 2012), eq. 3.
+    """
+    return 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
+
+
+@dataclass(frozen=True)
+class View:
+    """One depth image, ready to be asked what it says of a cell.
+
+    Attributes:
+        camera: (3, 4) world to camera.
+        optics: fx, fy, cx, cy, pixels.
+        reach: (levels, H, W) sparse tables: entry (k, v, u) is the minimum over the
+            2^k x 2^k window that begins at (v, u) of depth plus tolerance; infinite
+            where there is no return.
+        holes: the same, 0 where there is no return and 1 elsewhere.
+    """
+
+    camera: Float[np.ndarray, "3 4"]
+    optics: Float[np.ndarray, " 4"]
+    reach: Float32[np.ndarray, "levels h w"]
+    holes: Float32[np.ndarray, "levels h w"]
+
+
+def _sparse_tables(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "levels h w"]:
+    """Window minima for every power of two, so that any window takes a few look-ups."""
+    tables = [np.ascontiguousarray(image, dtype=np.float32)]
+    size = 1
+    while 2 * size <= min(image.shape):
+        last = tables[-1]
+        rows = last.copy()
+        np.minimum(last[:-size], last[size:], out=rows[:-size])
+        both = rows.copy()
+        np.minimum(rows[:, :-size], rows[:, size:], out=both[:, :-size])
+        tables.append(both)
+        size *= 2
+    return np.stack(tables)
+
+
+def make_view(observation: Observation, tolerance: float) -> View:
+    """Prepare an observation; `tolerance` (metres) is how far behind a return shadow begins.
+
+    The tolerance grows with the noise of the sensor: three standard deviations.
+    """
+    K = observation.intrinsics
+    depth = np.asarray(observation.depth, dtype=np.float64)
+    valid = depth > 0
+    reach = np.where(valid, depth + np.maximum(tolerance, 3.0 * depth_sigma(depth)), np.inf)
+    rotation = observation.pose[:3, :3].T
+    camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
+    return View(
+        camera=np.ascontiguousarray(camera),
+        optics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64),
+        reach=_sparse_tables(reach.astype(np.float32)),
+        holes=_sparse_tables(valid.astype(np.float32)),
+    )
+
+
+def classify_cells(
+    views: Sequence[View],
+    plane: Plane | None,
+    origin: Float[np.ndarray, " 3"],
+    spacing: float,
+    shape: tuple[int, int, int],
+) -> UInt8[np.ndarray, "nx ny nz"]:
+    """Status of every cell of a lattice: SEEN, OCCLUDED or UNOBSERVED.
+
+    Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that
+    sees a cell outweighs any number that do not. Cells wholly under the support plane
+    are called SEEN: the half-space answers for them.
+    """
+    status = np.full(shape, UNOBSERVED, dtype=np.uint8)
+    blocks = -(-shape[0] // _BLOCK)
+    for view in views:
+
+        def look(piece: slice, view: View = view) -> None:
+            kernels.classify_cells(
+                origin,
+                spacing,
+                view.camera,
+                view.optics,
+                view.reach,
+                view.holes,
+                status,
+                piece.start,
+                piece.stop,
+            )
+
+        run_chunked(look, blocks, 2)
+    if plane is not None:
+        run_chunked(
+            lambda piece: kernels.clear_below(
+                plane.normal, plane.offset, origin, spacing, status, piece.start, piece.stop
+            ),
+            shape[0],
+            16,
+        )
+    return status
+
+
+def classify_points(
+    views: Sequence[View], points: Float[np.ndarray, "n 3"]
+) -> UInt8[np.ndarray, " n"]:
+    """Status of every point: SEEN, OCCLUDED or UNOBSERVED."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    status = np.full(len(points), UNOBSERVED, dtype=np.uint8)
+    for view in views:
+        kernels.classify_points(
+            points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
+        )
+    return status
+
+
+def background_points(
+    views: Sequence[Observation], plane: Plane | None, height: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Unlabelled points off the support plane, and half the width of their pixels, metres.
+
+    "Off" is `height` metres, or three standard deviations of the depth noise as it
+    shows along the normal, if that is more. Without a plane every unlabelled point is.
+    """
+    kept, widths = [], []
+    for view in views:
+        points, labels = view.points()
+        depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
+        chosen = labels == 0
+        if plane is not None:
+            rays = points - view.camera_center
+            slope = np.abs(rays @ plane.normal) / np.maximum(depth, 1e-9)
+            threshold = np.maximum(height, 3.0 * depth_sigma(depth) * slope)
+            chosen &= plane.signed_distance(points) > threshold
+        kept.append(points[chosen])
+        focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
+        widths.append(0.5 * depth[chosen] / focal)
+    if not kept:
+        return np.empty((0, 3)), np.empty(0)
+    return np.concatenate(kept), np.concatenate(widths)
