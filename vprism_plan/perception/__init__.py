@@ -7,6 +7,7 @@ from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane
 from vprism_plan.perception.saving import save_observation
+from vprism_plan.perception.segmentation import segment_tabletop
 
 __all__ = [
     "Observation",
@@ -15,4 +16,5 @@ __all__ = [
     "fit_plane",
     "load_observation",
     "save_observation",
+    "segment_tabletop",
 ]

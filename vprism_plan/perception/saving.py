@@ -49,7 +49,9 @@ def _save_npz(obs: Observation, path: Path) -> None:
         "plane": _plane_numbers(obs),
     }
     present = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
-    write_atomically(path, lambda stream: np.savez_compressed(stream, **present))
+    write_atomically(
+        path, lambda stream: np.savez_compressed(stream, allow_pickle=False, **present)
+    )
 
 
 def _save_folder(obs: Observation, folder: Path) -> None:

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Depth images as graphs: which neighbouring pixels lie on one surface.
+
+Everything here is local to the image, so it costs a few array passes and no 3-D
+search. Two neighbours lie on one surface if their depth differs by no more than a
+oblique surface explains, with the sensor's noise on top.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+# Offsets (rows, columns) of half of the eight neighbours; the other half is symmetric.
+_HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
+# Slant (degrees) beyond which neighbours count as a jump. A pixel is deleted only where no
+# sensor would return anything from a surface; a cut is cheap, since what it cuts off goes
+# back to the nearest cluster, so it may come sooner and catch the mild ramps too.
+_LINK_SLANT = 75.0
+_FLYING_SLANT = 78.0
+_CUT_SLANT = 70.0
+# Along a step in depth between two objects height changes too; on a table top or the
+# lid of a box it does not, however obliquely it is seen.
+_LEVEL = 0.15
+
+Slices = tuple[slice, slice]
+
+
+def depth_noise(depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Return the assumed standard deviation of depth (m): 2 mm at 1 m, growing as depth^2."""
+    return np.asarray(0.002 * np.maximum(0.5, np.asarray(depth, dtype=np.float64)) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceImage:
+    """What the pixel graph needs to know of a view.
+
+    Attributes:
+        depth: (H, W) metres, 0 = no return.
+        height: (H, W) metres above the support plane, any value where there is no return.
+        pitch: (H, W) metres between neighbouring pixels on a surface that faces the camera.
+    """
+
+    depth: Float[np.ndarray, "h w"]
+    height: Float[np.ndarray, "h w"]
+    pitch: Float[np.ndarray, "h w"]
+
+    def pairs(
+        self, reach: int, slant: float
+    ) -> Iterator[tuple[Slices, Slices, np.ndarray, np.ndarray]]:
+        """Yield, for each of four directions, pixel pairs `reach` pixels apart.
+
+        Each item is (slices of the first pixel, slices of the second, both have a
+        return, step): step is -1, 0 or 1 for a jump towards the camera, none, or away.
+        """
+        rows, cols = self.depth.shape
+        for unit_row, unit_col in _HALF:
+            dr, dc = unit_row * reach, unit_col * reach
+            here = (slice(0, rows - dr), slice(max(0, -dc), cols - max(0, dc)))
+            there = (slice(dr, rows), slice(max(0, dc), cols - max(0, -dc)))
+            valid = (self.depth[here] > 0) & (self.depth[there] > 0)
+            change = self.depth[there] - self.depth[here]
+            nearer = np.minimum(self.depth[here], self.depth[there])
+            pitch = np.minimum(self.pitch[here], self.pitch[there])
+            per_pitch = float(np.hypot(dr, dc) * np.tan(np.radians(slant)))
+            explained = per_pitch * pitch + 2.0 * depth_noise(nearer)
+            rise = np.abs(self.height[there] - self.height[here])
+            jump = valid & (np.abs(change) > explained) & (rise > _LEVEL * np.abs(change))
+            yield here, there, valid, np.where(jump, np.sign(change), 0.0).astype(np.int8)
+
+
+def surface_image(
+    depth: Float[np.ndarray, "h w"],
+    intrinsics: Float[np.ndarray, "3 3"],
+    height: Float[np.ndarray, "h w"],
+) -> SurfaceImage:
+    """Prepare a view for the functions of this module."""
+    depth = np.asarray(depth, dtype=np.float64)
+    return SurfaceImage(depth, height, depth / min(intrinsics[0, 0], intrinsics[1, 1]))
+
+
+def graph_edges(
+    image: SurfaceImage, mask: Bool[np.ndarray, "h w"]
+) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Return the edges between neighbouring pixels of `mask` on one surface.
+
+    Pixels are numbered in the order of `np.flatnonzero(mask)`.
+    """
+    index = np.cumsum(mask.ravel()).reshape(mask.shape) - 1
+    starts, ends = [], []
+    for here, there, valid, step in image.pairs(1, _LINK_SLANT):
+        linked = mask[here] & mask[there] & valid & (step == 0)
+        starts.append(index[here][linked])
+        ends.append(index[there][linked])
+    return np.concatenate(starts), np.concatenate(ends)
+
+
+def components(
+    count: int, start: Int[np.ndarray, " m"], end: Int[np.ndarray, " m"]
+) -> Int[np.ndarray, " n"]:
+    """Number the connected components of a graph, from 0."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(start), dtype=bool), (start, end)), shape=(count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+
+
+def flying_pixels(image: SurfaceImage) -> Bool[np.ndarray, "h w"]:
+    """Find pixels that hang in the air between a near and a far surface.
+
+    Stereo and time-of-flight cameras blend the two sides of an edge into a ramp along
+    the line of sight: in some direction depth jumps the same way on both sides of such a
+    pixel. A pixel with fewer than two of its eight neighbours on its own surface is a
+    speck and counts too. Pixels at a clean edge have one side on their surface and stay.
+    """
+    valid_pixel = image.depth > 0
+    near = np.zeros(image.depth.shape, dtype=np.int8)
+    ramp = np.zeros(image.depth.shape, dtype=bool)
+    for here, there, valid, step in image.pairs(1, _FLYING_SLANT):
+        close = valid & (step == 0)
+        near[here] += close
+        near[there] += close
+        ahead = np.zeros(image.depth.shape, dtype=np.int8)
+        behind = np.zeros(image.depth.shape, dtype=np.int8)
+        ahead[here] = step
+        behind[there] = step
+        ramp |= (ahead != 0) & (ahead == behind)
+    return np.asarray(valid_pixel & (ramp | (near < 2)))
+
+
+def jump_pixels(image: SurfaceImage, reach: int = 2) -> Bool[np.ndarray, "h w"]:
+    """Find the pixels within `reach` of a jump in depth: edges, and all but the mildest ramps.
+
+    Cutting the graph here separates objects that the sensor's smoothing glues together.
+    """
+    jumps = np.zeros(image.depth.shape, dtype=bool)
+    for here, there, _, step in image.pairs(reach, _CUT_SLANT):
+        jumps[here] |= step != 0
+        jumps[there] |= step != 0
+    return jumps
+
+
+def specks(
+    image: SurfaceImage, mask: Bool[np.ndarray, "h w"], max_pixels: int, max_area: float
+) -> Bool[np.ndarray, "h w"]:
+    """Find pieces of `mask` that no surface continues: few pixels and a tiny area (m^2)."""
+    start, end = graph_edges(image, mask)
+    piece = components(int(mask.sum()), start, end)
+    pixels = np.bincount(piece)
+    area = np.bincount(piece, weights=image.pitch[mask] ** 2)
+    small = (pixels <= max_pixels) & (area <= max_area)
+    result = np.zeros(mask.shape, dtype=bool)
+    result[mask] = small[piece]
+    return result
