@@ -42,7 +42,7 @@ class SearchRequest:
     planner: str
     time_limit: float
     seed: int
-    stop: Literal["limit", "first", "converged"]
+    stop: str
     simplify: bool
     simplify_time: float
     step: float | None

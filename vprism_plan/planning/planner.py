@@ -2,11 +2,13 @@
 """`plan`: one query, one honest answer."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._planners import planner_kind
@@ -21,13 +23,13 @@ from vprism_plan.planning.result import PlanReport, PlanResult
 
 def plan(
     checker: CheckerLike,
-    start: Shaped[Any, " dof"],
-    goal: Shaped[Any, "..."],
+    start: ArrayLike | Sequence[float],
+    goal: ArrayLike | Sequence[float],
     planner: str = "RRTConnect",
-    time_limit: float = 5.0,
+    time_limit: float | int = 5.0,
     seed: int = 0,
     *,
-    stop: Literal["limit", "first", "converged"] = "limit",
+    stop: str = "limit",
     convergence: tuple[float, int] = (0.01, 1000),
     simplify: bool = True,
     simplify_time: float = 2.0,
@@ -52,8 +54,9 @@ def plan(
         seed: an integer from 0. The same seed gives the same path as long as the search
             ends by itself before the limit. OMPL's generator is global: this seeds it.
         stop: when the optimising planners (RRTstar, InformedRRTstar, BITstar, AORRTC)
-            stop: at the time limit (their path then depends on the machine's speed),
-            at the first solution, or when the cost has converged.
+            stop: "limit", at the time limit (their path then depends on the machine's
+            speed); "first", at the first solution; "converged", when the path length
+            has settled. The others stop at their first solution in any case.
         convergence: for stop="converged": (tolerance, patience), stop when `patience`
             iterations have shortened the path by less than the fraction `tolerance`.
         simplify: whether to shorten the path after the search.
@@ -115,9 +118,9 @@ def plan(
 
 def _request(
     planner: str,
-    time_limit: float,
+    time_limit: float | int,
     seed: int,
-    stop: Literal["limit", "first", "converged"],
+    stop: str,
     convergence: tuple[float, int],
     simplify: bool,
     simplify_time: float,

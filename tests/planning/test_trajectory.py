@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Timing keeps the limits and never leaves the path; files come back as they were."""
+
+import json
+from itertools import pairwise
+
+import disk_world
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from vprism_plan.errors import PlanningError
+from vprism_plan.planning import (
+    Trajectory,
+    read_trajectory,
+    time_parameterize,
+    write_trajectory,
+)
+
+ROBOT = disk_world.robot(2)
+
+
+def distance_to_polyline(q, path):
+    best = np.inf
+    for a, b in pairwise(path):
+        d = b - a
+        t = np.clip((q - a) @ d / max(d @ d, 1e-300), 0.0, 1.0)
+        best = min(best, np.linalg.norm(q - a - t * d))
+    return best
+
+
+coordinates = st.lists(
+    st.lists(st.floats(-3.0, 3.0).map(lambda x: round(x, 3)), min_size=2, max_size=2),
+    min_size=2,
+    max_size=6,
+)
+
+
+@settings(max_examples=80, deadline=None)
+@given(points=coordinates, scale=st.floats(0.05, 1.0))
+def test_limits_hold_and_the_path_is_not_left(points, scale):
+    path = np.array(points)
+    assume(np.any(np.diff(path, axis=0) != 0.0))
+    velocity, acceleration = np.array([1.0, 2.0]), np.array([0.7, 5.0])
+    trajectory = time_parameterize(ROBOT, path, velocity, acceleration, scale=scale)
+    fine = np.linspace(0.0, trajectory.duration, 3001)
+    q, v = trajectory.sample(fine)
+    assert np.all(np.abs(v) <= scale * velocity * (1 + 1e-9) + 1e-12)
+    rate = np.abs(np.diff(v, axis=0)) / np.diff(fine)[:, None]
+    assert np.all(rate <= scale * acceleration * (1 + 1e-6) + 1e-9)
+    assert np.array_equal(q[0], path[0])
+    assert np.array_equal(trajectory.positions[-1], path[-1])
+    assert np.all(trajectory.velocities[[0, -1]] == 0.0)
+    assert max(distance_to_polyline(p, path) for p in q[::30]) < 1e-8
+    # The positions are the integral of the velocities: nothing jumps.
+    walked = q[0] + np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(fine)[:, None], axis=0)
+    assert np.abs(walked - q[1:]).max() < 1e-3
+    for waypoint in path:
+        assert np.min(np.linalg.norm(trajectory.positions - waypoint, axis=1)) < 1e-9
+
+
+def test_a_long_line_cruises_at_the_limit_and_takes_the_time_it_must():
+    trajectory = time_parameterize(
+        ROBOT, np.array([[0.0, 0.0], [3.0, 0.0]]), [1.0, 1.0], [2.0, 2.0]
+    )
+    assert trajectory.duration == pytest.approx(3.0 / 1.0 + 1.0 / 2.0)
+    assert trajectory.sample(np.array([1.0]))[1][0].tolist() == pytest.approx([1.0, 0.0])
+
+
+def test_a_short_line_never_reaches_full_speed():
+    trajectory = time_parameterize(
+        ROBOT, np.array([[0.0, 0.0], [0.1, 0.0]]), [1.0, 1.0], [2.0, 2.0]
+    )
+    assert trajectory.duration == pytest.approx(2 * np.sqrt(0.1 / 2.0))
+    assert np.max(trajectory.velocities) == pytest.approx(2.0 * np.sqrt(0.1 / 2.0))
+
+
+def test_waypoints_on_a_line_do_not_slow_the_motion_and_corners_do():
+    line = np.array([[0.0, 0.0], [1.0, 1.0], [1.5, 1.5], [3.0, 3.0]])
+    whole = time_parameterize(ROBOT, line[[0, -1]])
+    assert time_parameterize(ROBOT, line).duration == pytest.approx(whole.duration)
+    corner = time_parameterize(ROBOT, np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]))
+    at = np.argmin(np.linalg.norm(corner.positions - [1.0, 0.0], axis=1))
+    assert np.all(corner.velocities[at] == 0.0)
+    back = time_parameterize(ROBOT, np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]))
+    assert np.all(back.velocities[np.argmax(back.positions[:, 0])] == 0.0)
+
+
+@pytest.mark.parametrize("path", [[[0.1, 0.2]], [[0.1, 0.2]] * 3])
+def test_a_path_that_goes_nowhere_takes_no_time(path):
+    trajectory = time_parameterize(ROBOT, np.array(path))
+    assert trajectory.duration == 0.0
+    assert trajectory.positions.tolist() == [[0.1, 0.2]]
+    assert trajectory.sample(np.array([0.0, 1.0]))[0].tolist() == [[0.1, 0.2]] * 2
+
+
+def test_defaults_come_from_the_robot():
+    trajectory = time_parameterize(ROBOT, np.array([[0.0, 0.0], [9.0, 0.0]]))
+    assert np.max(np.abs(trajectory.velocities)) == pytest.approx(ROBOT.velocity_limits[0])
+    assert trajectory.times[1] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"velocity_limits": [1.0, np.inf]}, "velocity limit of joint 'joint_1' is inf"),
+    ({"velocity_limits": [0.0, 1.0]}, "velocity limit of joint 'joint_0' is 0"),
+    ({"acceleration_limits": [1.0, np.nan]}, "acceleration limit of joint 'joint_1' is nan"),
+    ({"velocity_limits": [1.0]}, "shape"),
+    ({"scale": 0.0}, "scale is 0"),
+    ({"scale": 1.5}, "scale is 1.5"),
+])  # fmt: skip
+def test_unusable_limits_are_named(arguments, message):
+    with pytest.raises(PlanningError, match=message):
+        time_parameterize(ROBOT, np.array([[0.0, 0.0], [1.0, 1.0]]), **arguments)
+
+
+@pytest.mark.parametrize("path", [np.zeros((2, 3)), np.zeros((0, 2)), np.array([[0.0, np.nan]])])
+def test_unusable_paths_are_refused(path):
+    with pytest.raises(PlanningError, match="path"):
+        time_parameterize(ROBOT, path)
+
+
+def test_a_file_holds_the_ros_message_and_comes_back(tmp_path):
+    path = np.array([[0.0, 0.0], [1.0, -0.5], [0.3, 0.3]])
+    trajectory = time_parameterize(ROBOT, path)
+    file = tmp_path / "trajectory.json"
+    write_trajectory(file, ROBOT, trajectory, frame_id="base_link")
+    message = json.loads(file.read_text())
+    assert set(message) == {"header", "joint_names", "points"}
+    assert message["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "base_link"}
+    assert message["joint_names"] == ["joint_0", "joint_1"]
+    for point in message["points"]:
+        assert set(point) == {
+            "positions", "velocities", "accelerations", "effort", "time_from_start",
+        }  # fmt: skip
+        assert isinstance(point["time_from_start"]["sec"], int)
+        assert 0 <= point["time_from_start"]["nanosec"] < 10**9
+    names, back = read_trajectory(file)
+    assert names == ("joint_0", "joint_1")
+    assert np.array_equal(back.positions, trajectory.positions)
+    assert np.array_equal(back.velocities, trajectory.velocities)
+    np.testing.assert_allclose(back.times, trajectory.times, atol=1e-9)
+
+
+def test_a_nanosecond_carries_into_the_second(tmp_path):
+    almost = Trajectory(np.array([0.0, 1.9999999999]), np.zeros((2, 2)), np.zeros((2, 2)))
+    write_trajectory(tmp_path / "t.json", ROBOT, almost)
+    points = json.loads((tmp_path / "t.json").read_text())["points"]
+    assert points[1]["time_from_start"] == {"sec": 2, "nanosec": 0}
+
+
+def test_a_trajectory_that_cannot_be_written_leaves_the_old_file(tmp_path):
+    file = tmp_path / "t.json"
+    file.write_text("old")
+    broken = Trajectory(np.array([0.0]), np.full((1, 2), np.nan), np.zeros((1, 2)))
+    with pytest.raises(ValueError, match="JSON"):
+        write_trajectory(file, ROBOT, broken)
+    with pytest.raises(PlanningError, match="nanosecond"):
+        write_trajectory(file, ROBOT, Trajectory(np.zeros(2), np.zeros((2, 2)), np.zeros((2, 2))))
+    with pytest.raises(PlanningError, match="joints"):
+        write_trajectory(file, disk_world.robot(3), broken)
+    assert file.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["t.json"]
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"joint_names": []}', '{"joint_names": 3}'])
+def test_a_file_that_is_no_trajectory_is_named(tmp_path, text):
+    file = tmp_path / "bad.json"
+    file.write_text(text)
+    with pytest.raises(PlanningError, match=r"bad\.json"):
+        read_trajectory(file)
+    with pytest.raises(PlanningError, match=r"missing\.json"):
+        read_trajectory(tmp_path / "missing.json")
