@@ -11,9 +11,182 @@ value 0 exactly, so a result does not depend on which points share its block.
 import math
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
-BLOCK = 64  # points per block at most: scratch arrays then stay in the first-level cache
+BLOCK = 16  # points per block at most; also the width, padded with zeros, of its features
+_LANES = 8  # doubles per vector; two vectors hold a block
+_PARTS = BLOCK // _LANES
+
+
+# ---------------------------------------------------------------- vector loops
+# The compiler does not keep accumulators in registers across a loop over array memory,
+# which costs a factor of four here. These two loops are therefore spelled out: all
+# arguments are addresses and counts, `classes` of them are handled per call, and each
+# of the 16 points of a block is one vector lane, so no sum depends on its neighbours.
+_VECTOR = ir.VectorType(ir.DoubleType(), _LANES)
+
+
+def _at(builder, address, offset, kind):
+    """Pointer of the given type, `offset` doubles after an integer address."""
+    size = ir.Constant(offset.type, 8)
+    return builder.inttoptr(builder.add(address, builder.mul(offset, size)), kind.as_pointer())
+
+
+def _load_parts(builder, address, offset):
+    parts = []
+    for part in range(_PARTS):
+        at = builder.add(offset, ir.Constant(offset.type, part * _LANES))
+        parts.append(builder.load(_at(builder, address, at, _VECTOR), align=8))
+    return parts
+
+
+def _fused(builder, a, b, c):
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
+    name = f"llvm.fmuladd.v{_LANES}f64"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [a, b, c])
+
+
+def _spread(builder, scalar):
+    """Vector with the scalar in every lane."""
+    index = ir.Constant(ir.IntType(32), 0)
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, index)
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), _LANES), [0] * _LANES)
+    return builder.shuffle_vector(one, one, mask)
+
+
+def _make_row_products(classes):
+    """out[k, p] = sum_j matrix[(entry + own[j]) * stride + k] phi[j, p], first <= j < last."""
+
+    @intrinsic
+    def row_products(typingctx, matrix, entry, stride, own, first, last, phi, out):
+        def codegen(context, builder, signature, args):
+            matrix, entry, stride, own, first, last, phi, out = args
+            whole = first.type
+            before = builder.block
+            loop = builder.append_basic_block("row_loop")
+            done = builder.append_basic_block("row_done")
+            zero = ir.Constant(_VECTOR, [0.0] * _LANES)
+            builder.cbranch(builder.icmp_signed("<", first, last), loop, done)
+            builder.position_at_end(loop)
+            j = builder.phi(whole)
+            j.add_incoming(first, before)
+            sums = [builder.phi(_VECTOR) for _ in range(classes * _PARTS)]
+            column = builder.load(_at(builder, own, j, whole))
+            at = builder.mul(builder.add(entry, column), stride)
+            values = _load_parts(builder, phi, builder.mul(j, ir.Constant(whole, BLOCK)))
+            updated = []
+            for k in range(classes):
+                place = builder.add(at, ir.Constant(whole, k))
+                scalar = builder.load(_at(builder, matrix, place, ir.DoubleType()))
+                spread = _spread(builder, scalar)
+                for part in range(_PARTS):
+                    total = sums[k * _PARTS + part]
+                    updated.append(_fused(builder, spread, values[part], total))
+            following = builder.add(j, ir.Constant(whole, 1))
+            builder.cbranch(builder.icmp_signed("<", following, last), loop, done)
+            j.add_incoming(following, loop)
+            for total, new in zip(sums, updated, strict=True):
+                total.add_incoming(zero, before)
+                total.add_incoming(new, loop)
+            builder.position_at_end(done)
+            results = [builder.phi(_VECTOR) for _ in sums]
+            for result, new in zip(results, updated, strict=True):
+                result.add_incoming(zero, before)
+                result.add_incoming(new, loop)
+            for index, result in enumerate(results):
+                at = ir.Constant(whole, index * _LANES)
+                builder.store(result, _at(builder, out, at, _VECTOR), align=8)
+            return context.get_dummy_value()
+
+        return types.void(*[types.intp] * 8), codegen
+
+    return row_products
+
+
+def _make_gram_products(classes):
+    """matrix[(entry + own[j]) * stride + k] += sum_p scaled[k, p] phi[j, p], first <= j < last."""
+
+    @intrinsic
+    def gram_products(typingctx, matrix, entry, stride, own, first, last, phi, scaled):
+        def codegen(context, builder, signature, args):
+            matrix, entry, stride, own, first, last, phi, scaled = args
+            whole = first.type
+            double = ir.DoubleType()
+            weights = [
+                _load_parts(builder, scaled, ir.Constant(whole, k * BLOCK))
+                for k in range(classes)
+            ]
+            add_all = cgutils.get_or_insert_function(
+                builder.module,
+                ir.FunctionType(double, [double, _VECTOR]),
+                f"llvm.vector.reduce.fadd.v{_LANES}f64",
+            )
+            with cgutils.for_range_slice(
+                builder, first, last, ir.Constant(whole, 1), intp=whole
+            ) as (j, _):
+                column = builder.load(_at(builder, own, j, whole))
+                at = builder.mul(builder.add(entry, column), stride)
+                values = _load_parts(builder, phi, builder.mul(j, ir.Constant(whole, BLOCK)))
+                for k in range(classes):
+                    total = builder.fmul(weights[k][0], values[0])
+                    for part in range(1, _PARTS):
+                        total = _fused(builder, weights[k][part], values[part], total)
+                    # "reassoc" lets the lanes be added as a tree: a fixed order all the same.
+                    one = builder.call(
+                        add_all, [ir.Constant(double, 0.0), total], fastmath=("reassoc",)
+                    )
+                    place = _at(builder, matrix, builder.add(at, ir.Constant(whole, k)), double)
+                    builder.store(builder.fadd(builder.load(place), one), place)
+            return context.get_dummy_value()
+
+        return types.void(*[types.intp] * 8), codegen
+
+    return gram_products
+
+
+_row_products_4, _row_products_2, _row_products_1 = map(_make_row_products, (4, 2, 1))
+_gram_products_4, _gram_products_2, _gram_products_1 = map(_make_gram_products, (4, 2, 1))
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def _row_products(matrix, entry, own, first, last, phi, out):
+    """out[k, p] = sum over first <= j < last of matrix[entry + own[j], k] phi[j, p]."""
+    K = matrix.shape[1]
+    k = 0
+    while k < K:
+        at = matrix.ctypes.data + 8 * k
+        to = out.ctypes.data + 8 * BLOCK * k
+        if K - k >= 4:
+            _row_products_4(at, entry, K, own.ctypes.data, first, last, phi.ctypes.data, to)
+            k += 4
+        elif K - k >= 2:
+            _row_products_2(at, entry, K, own.ctypes.data, first, last, phi.ctypes.data, to)
+            k += 2
+        else:
+            _row_products_1(at, entry, K, own.ctypes.data, first, last, phi.ctypes.data, to)
+            k += 1
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def _gram_products(matrix, entry, own, first, last, phi, scaled):
+    """matrix[entry + own[j], k] += sum_p scaled[k, p] phi[j, p] for first <= j < last."""
+    K = matrix.shape[1]
+    k = 0
+    while k < K:
+        to = matrix.ctypes.data + 8 * k
+        at = scaled.ctypes.data + 8 * BLOCK * k
+        if K - k >= 4:
+            _gram_products_4(to, entry, K, own.ctypes.data, first, last, phi.ctypes.data, at)
+            k += 4
+        elif K - k >= 2:
+            _gram_products_2(to, entry, K, own.ctypes.data, first, last, phi.ctypes.data, at)
+            k += 2
+        else:
+            _gram_products_1(to, entry, K, own.ctypes.data, first, last, phi.ctypes.data, at)
+            k += 1
 
 
 # ---------------------------------------------------------------- negative samples
@@ -88,7 +261,57 @@ def ray_samples(points, origin, centers, radius, step, first, count, uniform):
     return samples, keep
 
 
-# ---------------------------------------------------------------- hinges near a block
+# ---------------------------------------------------------------- blocks of near points
+@njit(cache=True, nogil=True, fastmath=False)
+def morton_keys(points, lower, edge):
+    """Interleaved bits of every point's cell: points with near keys are near each other."""
+    keys = np.empty(len(points), np.int64)
+    for p in range(len(points)):
+        key = 0
+        for a in range(3):
+            cell = int((points[p, a] - lower[a]) / edge)
+            cell = min(max(cell, 0), 0x1FFFFF)
+            # Spread 21 bits, two zeros between each.
+            cell = (cell | cell << 32) & 0x1F00000000FFFF
+            cell = (cell | cell << 16) & 0x1F0000FF0000FF
+            cell = (cell | cell << 8) & 0x100F00F00F00F00F
+            cell = (cell | cell << 4) & 0x10C30C30C30C30C3
+            cell = (cell | cell << 2) & 0x1249249249249249
+            key |= cell << a
+        keys[p] = key
+    return keys
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def cut_blocks(points, order, extent):
+    """Starts of blocks of at most BLOCK points, none wider than `extent`; ends with n."""
+    n = len(order)
+    starts = np.empty(n + 1, np.int64)
+    count = 0
+    lower = np.empty(3)
+    upper = np.empty(3)
+    begin = 0
+    for p in range(n):
+        wide = False
+        for a in range(3):
+            x = points[order[p], a]
+            if p > begin:
+                wide |= max(upper[a], x) - min(lower[a], x) > extent
+        if p == begin or wide or p - begin == BLOCK:
+            begin = p
+            starts[count] = p
+            count += 1
+            for a in range(3):
+                lower[a] = points[order[p], a]
+                upper[a] = lower[a]
+        for a in range(3):
+            x = points[order[p], a]
+            lower[a] = min(lower[a], x)
+            upper[a] = max(upper[a], x)
+    starts[count] = n
+    return starts[: count + 1].copy()
+
+
 @njit(cache=True, nogil=True, fastmath=False)
 def _near_box(lower, upper, hinges, cell_start, cell_items, grid_lower, cell, shape, radius, out):
     """Write the sorted indices of the hinges within `radius` of a box; return how many."""
@@ -135,7 +358,10 @@ def _block_box(points, order, start, stop, lower, upper):
 
 @njit(cache=True, nogil=True, fastmath=False)
 def _fill_features(points, order, start, stop, hinges, near, n, gamma, reach, phi):
-    """phi[u, p] for the hinges `near[:n]`, and row n for the bias."""
+    """phi[u, p] for the hinges `near[:n]`, and row n for the bias; zeros beyond the points."""
+    for u in range(n + 1):
+        for p in range(stop - start, BLOCK):
+            phi[u, p] = 0.0
     for u in range(n):
         h = near[u]
         hx = hinges[h, 0]
@@ -173,7 +399,7 @@ def count_neighbours(
 def block_features(
     points, order, block_start, lo, hi, hinges,
     cell_start, cell_items, grid_lower, cell, shape, radius, gamma, reach,
-    near_start, phi_start, near_out, phi_out,
+    near_start, near_out, phi_out,
 ):  # fmt: skip
     """Hinge lists and feature matrices (hinge-major) of the blocks lo..hi, bias last."""
     near = np.empty(len(hinges) + 1, np.int64)
@@ -186,113 +412,89 @@ def block_features(
         n = _near_box(
             lower, upper, hinges, cell_start, cell_items, grid_lower, cell, shape, radius, near
         )
-        size = stop - start
-        phi = phi_out[phi_start[b] : phi_start[b + 1]].reshape(n + 1, size)
+        phi = phi_out[near_start[b] : near_start[b] + n + 1]
         _fill_features(points, order, start, stop, hinges, near, n, gamma, reach, phi)
         near_out[near_start[b] : near_start[b] + n + 1] = near[: n + 1]
 
 
 # ---------------------------------------------------------------- learning
 @njit(cache=True, nogil=True, fastmath=False)
-def gram_rows(
-    block_start, near_start, phi_start, near, phi_all, weights, row_first, base, lo, hi, out
-):
+def gram_rows(block_start, near_start, near, phi_all, weights, row_first, base, lo, hi, out):
     """Add sum_p weights[p, k] phi_i phi_j to the envelope rows lo..hi, all classes at once.
 
     Rows are owned by the caller, so threads need no locks and the order of every sum
     is that of the points, whatever the number of threads.
     """
     K = weights.shape[1]
-    scaled = np.empty((BLOCK, K))
+    scaled = np.zeros((K, BLOCK))
     for b in range(len(block_start) - 1):
         start = block_start[b]
         size = block_start[b + 1] - start
         own = near[near_start[b] : near_start[b + 1]]
-        phi = phi_all[phi_start[b] : phi_start[b + 1]].reshape(len(own), size)
+        phi = phi_all[near_start[b] : near_start[b + 1]]
         first = np.searchsorted(own, lo)
         last = np.searchsorted(own, hi)
+        for p in range(size, BLOCK):
+            for k in range(K):
+                scaled[k, p] = 0.0
         for i in range(first, last):
             row = own[i]
-            left = row_first[row]
-            used = 0
+            used = False
             for p in range(size):
                 f = phi[i, p]
-                if f != 0.0:
-                    used += 1
+                used |= f != 0.0
                 for k in range(K):
-                    scaled[p, k] = weights[start + p, k] * f
-            if used == 0:
-                continue
-            for j in range(i + 1):
-                column = own[j]
-                if column < left:
-                    continue
-                entry = base[row] + column
-                for p in range(size):
-                    f = phi[j, p]
-                    if f != 0.0:
-                        for k in range(K):
-                            out[entry, k] += f * scaled[p, k]
+                    scaled[k, p] = weights[start + p, k] * f
+            if used:
+                # Hinges before the envelope are too far apart for any point to see both.
+                j = np.searchsorted(own, row_first[row])
+                _gram_products(out, base[row], own, j, i + 1, phi, scaled)
 
 
 @njit(cache=True, nogil=True, fastmath=False)
-def feature_sums(block_start, near_start, phi_start, near, phi_all, weights, out):
+def feature_sums(block_start, near_start, near, phi_all, weights, out):
     """out[h, k] += sum_p weights[p, k] phi_h(p)."""
     K = weights.shape[1]
     for b in range(len(block_start) - 1):
         start = block_start[b]
         size = block_start[b + 1] - start
-        own = near[near_start[b] : near_start[b + 1]]
-        phi = phi_all[phi_start[b] : phi_start[b + 1]].reshape(len(own), size)
-        for i in range(len(own)):
+        for u in range(near_start[b], near_start[b + 1]):
             for p in range(size):
-                f = phi[i, p]
+                f = phi_all[u, p]
                 if f != 0.0:
                     for k in range(K):
-                        out[own[i], k] += f * weights[start + p, k]
+                        out[near[u], k] += f * weights[start + p, k]
 
 
 @njit(cache=True, nogil=True, fastmath=False)
-def _block_moments(own, n, phi, size, mean, cov, row_first, base, partial, m_out, v_out):
-    """Mean and variance (K, size) of the logits of one block; `partial` is scratch."""
+def _block_moments(own, phi, mean, cov, row_first, base, partial, m_out, v_out):
+    """Mean and variance (K, BLOCK) of the logits of one block; `partial` is scratch."""
     K = mean.shape[1]
     for k in range(K):
-        for p in range(size):
+        for p in range(BLOCK):
             m_out[k, p] = 0.0
             v_out[k, p] = 0.0
-    for i in range(n):
+    for i in range(len(own)):
         row = own[i]
-        left = row_first[row]
-        for k in range(K):
-            for p in range(size):
-                partial[k, p] = 0.0
-        for j in range(i):
-            column = own[j]
-            if column < left:
-                continue  # too far apart for any point to see both
-            entry = base[row] + column
-            for k in range(K):
-                s = cov[entry, k]
-                for p in range(size):
-                    partial[k, p] += s * phi[j, p]
+        j = np.searchsorted(own, row_first[row])
+        _row_products(cov, base[row], own, j, i, phi, partial)
         diagonal = base[row] + row
         for k in range(K):
             s = cov[diagonal, k]
             w = mean[row, k]
-            for p in range(size):
+            for p in range(BLOCK):
                 f = phi[i, p]
                 v_out[k, p] += f * (s * f + 2.0 * partial[k, p])
                 m_out[k, p] += w * f
     for k in range(K):
-        for p in range(size):
+        for p in range(BLOCK):
             v_out[k, p] = max(v_out[k, p], 0.0)
 
 
 @njit(cache=True, nogil=True, fastmath=False)
 def stored_moments(
-    block_start, lo, hi, near_start, phi_start, near, phi_all, mean, cov, row_first, base,
-    mean_out, var_out,
-):  # fmt: skip
+    block_start, near_start, near, phi_all, lo, hi, mean, cov, row_first, base, mean_out, var_out
+):
     """Logit moments (points, K) of the blocks lo..hi whose features are stored."""
     K = mean.shape[1]
     partial = np.empty((K, BLOCK))
@@ -300,11 +502,10 @@ def stored_moments(
     v = np.empty((K, BLOCK))
     for b in range(lo, hi):
         start = block_start[b]
-        size = block_start[b + 1] - start
         own = near[near_start[b] : near_start[b + 1]]
-        phi = phi_all[phi_start[b] : phi_start[b + 1]].reshape(len(own), size)
-        _block_moments(own, len(own), phi, size, mean, cov, row_first, base, partial, m, v)
-        for p in range(size):
+        phi = phi_all[near_start[b] : near_start[b + 1]]
+        _block_moments(own, phi, mean, cov, row_first, base, partial, m, v)
+        for p in range(block_start[b + 1] - start):
             for k in range(K):
                 mean_out[start + p, k] = m[k, p]
                 var_out[start + p, k] = v[k, p]
@@ -335,7 +536,9 @@ def point_moments(
             lower, upper, hinges, cell_start, cell_items, grid_lower, cell, shape, radius, near
         )
         _fill_features(points, order, start, stop, hinges, near, n, gamma, reach, phi)
-        _block_moments(near, n + 1, phi, size, mean, cov, row_first, base, partial, m, v)
+        _block_moments(
+            near[: n + 1], phi, mean, cov, row_first, base, partial, m, v
+        )  # fmt: skip
         for p in range(size):
             q = order[start + p]
             total = 0.0
@@ -454,27 +657,22 @@ def normalised_log_odds(mean, var, lo, hi, limit, out):
 
 # ---------------------------------------------------------------- envelopes
 @njit(cache=True, nogil=True, fastmath=False)
-def unpack_block(data, k, row_first, base, rows, columns, out):
-    """Dense block [rows[0]:rows[1], columns[0]:columns[1]] of class k's lower triangle.
-
-    Entries above the diagonal are mirrored, entries outside the envelope are 0.
-    """
-    for i in range(rows[0], rows[1]):
-        for j in range(columns[0], columns[1]):
-            r = max(i, j)
-            c = min(i, j)
-            value = data[base[r] + c, k] if c >= row_first[r] else 0.0
-            out[i - rows[0], j - columns[0]] = value
+def unpack(data, k, row_first, base, out):
+    """Class k's symmetric matrix into the dense, zeroed `out`."""
+    for i in range(len(base)):
+        for j in range(row_first[i], i + 1):
+            value = data[base[i] + j, k]
+            out[i, j] = value
+            out[j, i] = value
 
 
 @njit(cache=True, nogil=True, fastmath=False)
-def pack_block(block, k, row_first, base, rows, columns, data):
-    """Write the lower triangle of a dense block back into class k's envelope."""
-    for i in range(rows[0], rows[1]):
-        first = max(columns[0], row_first[i])
-        last = min(columns[1], i + 1)
-        for j in range(first, last):
-            data[base[i] + j, k] = block[i - rows[0], j - columns[0]]
+def pack(dense, k0, row_first, base, data):
+    """Lower triangles of `dense` (n, M, M) into the classes k0, k0 + 1, ... of an envelope."""
+    for i in range(len(base)):
+        for j in range(row_first[i], i + 1):
+            for k in range(len(dense)):
+                data[base[i] + j, k0 + k] = dense[k, i, j]
 
 
 @njit(cache=True, nogil=True, fastmath=False)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from vprism_plan._kernels import mapping as kernels
 from vprism_plan._threads import run_chunked, worker_count
 from vprism_plan.errors import MapError
-from vprism_plan.mapping.factors import invert_class
+from vprism_plan.mapping.factors import invert_classes
 from vprism_plan.mapping.features import BlockFeatures, FeatureSpace
 
 
@@ -146,15 +146,14 @@ def logit_moments(
     """Return mean and variance of every training point's logits, in block order."""
     n, classes = len(features.order), mean.shape[1]
     m, v = np.empty((n, classes)), np.empty((n, classes))
-    block_start, near_start, phi_start, near, phi = features.arguments
 
     def blocks(chunk: slice) -> None:
         kernels.stored_moments(
-            block_start, chunk.start, chunk.stop, near_start, phi_start, near, phi,
+            *features.arguments, chunk.start, chunk.stop,
             mean, covariance, space.row_first, space.base, m, v,
         )  # fmt: skip
 
-    run_chunked(blocks, len(block_start) - 1, 64)
+    run_chunked(blocks, len(features.block_start) - 1, 256)
     return m, v
 
 
@@ -197,12 +196,7 @@ def fit_weights(
         information = prior_information.copy()
         linear = one_hot - 0.5 + 2.0 * alpha[:, None] * weight
         kernels.feature_sums(*features.arguments, linear, information)
-        log_determinant = np.array(
-            [
-                invert_class(space, precision, information, k, mean, covariance)
-                for k in range(classes)
-            ]
-        )
+        log_determinant = invert_classes(space, precision, information, mean, covariance)
         posterior = Posterior(mean, covariance, precision, log_determinant, ())
         m, v = logit_moments(space, features, mean, covariance)
         for _ in range(variational_updates):

@@ -9,6 +9,7 @@ the diagonal (plus the bias, which is last). Cholesky factors stay inside the en
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -92,7 +93,7 @@ class FeatureSpace:
         return start, items, lower, edge, shape, self.radius
 
     @property
-    def kernel_arguments(self) -> tuple:
+    def kernel_arguments(self) -> tuple[Any, ...]:
         """What every kernel that finds neighbours takes, after the points and blocks."""
         return (self.hinges, *self.cells)
 
@@ -105,53 +106,56 @@ class FeatureSpace:
 
 
 def make_blocks(
-    points: Float[np.ndarray, "n 3"], edge: float
+    points: Float[np.ndarray, "n 3"], extent: float
 ) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " b"]]:
-    """Group points by cells of `edge` (m): their order, and where each block starts.
+    """Group near points: their order along a Morton curve, and where each block starts.
 
-    A block holds at most `kernels.BLOCK` points; the starts end with n.
+    A block holds at most `kernels.BLOCK` points and is at most `extent` (m) wide; the
+    starts end with n.
     """
-    n = len(points)
-    if n == 0:
+    if len(points) == 0:
         return np.zeros(0, np.int64), np.zeros(1, np.int64)
-    cells = np.floor(points / edge)
-    cells -= cells.min(axis=0)
-    shape = cells.max(axis=0).astype(np.int64) + 1
-    index = cells.astype(np.int64)
-    key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    start = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
-    length = np.diff(np.append(start, n))
-    pieces = -(-length // kernels.BLOCK)
-    within = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    block = np.repeat(start, pieces) + within * kernels.BLOCK
-    return order.astype(np.int64), np.append(block, n).astype(np.int64)
+    lower = points.min(axis=0)
+    widest = float((points.max(axis=0) - lower).max())
+    # 20 bits per axis fit the key; cells much smaller than a block's width are enough.
+    edge = max(0.2 * extent, widest / 2**20, 1e-12)
+    order = np.argsort(kernels.morton_keys(points, lower, edge), kind="stable").astype(np.int64)
+    return order, kernels.cut_blocks(points, order, extent)
 
 
 @dataclass(frozen=True, eq=False)
 class BlockFeatures:
-    """Features of training points, block by block (points are stored in block order)."""
+    """Features of training points, block by block.
+
+    Attributes:
+        order: the points in block order.
+        block_start: where each block starts in `order`, then n.
+        near_start: where each block's hinges start in `near` and `phi`.
+        near: hinge indices, sorted within a block, the bias last.
+        phi: features of the block's points, zero-padded.
+    """
 
     order: Int64[np.ndarray, " n"]
     block_start: Int64[np.ndarray, " b1"]
     near_start: Int64[np.ndarray, " b1"]
-    phi_start: Int64[np.ndarray, " b1"]
     near: Int64[np.ndarray, " e"]
-    phi: Float[np.ndarray, " f"]
+    phi: Float[np.ndarray, "e p"]
 
     @property
-    def arguments(self) -> tuple:
+    def arguments(self) -> tuple[Any, ...]:
         """What the learning kernels take: starts, hinge lists and features."""
-        return self.block_start, self.near_start, self.phi_start, self.near, self.phi
+        return self.block_start, self.near_start, self.near, self.phi
 
 
-def block_features(
-    space: FeatureSpace, points: Float[np.ndarray, "n 3"], edge: float
-) -> BlockFeatures:
-    """Transform points (m), grouped in cells of `edge` (m)."""
+def block_extent(space: FeatureSpace) -> float:
+    """Return the width of a block (m) that balances shared hinges against padding."""
+    return 0.4 * space.radius
+
+
+def block_features(space: FeatureSpace, points: Float[np.ndarray, "n 3"]) -> BlockFeatures:
+    """Transform points (m)."""
     points = np.ascontiguousarray(points, dtype=np.float64)
-    order, block_start = make_blocks(points, edge)
+    order, block_start = make_blocks(points, block_extent(space))
     blocks = len(block_start) - 1
     count = np.zeros(blocks, np.int64)
     cells = space.kernel_arguments
@@ -159,18 +163,17 @@ def block_features(
     def count_chunk(piece: slice) -> None:
         kernels.count_neighbours(points, order, block_start, piece.start, piece.stop, *cells, count)
 
-    run_chunked(count_chunk, blocks, 256)
+    run_chunked(count_chunk, blocks, 512)
     near_start = np.concatenate(([0], np.cumsum(count + 1)))
-    phi_start = np.concatenate(([0], np.cumsum((count + 1) * np.diff(block_start))))
     near = np.empty(near_start[-1], np.int64)
-    phi = np.empty(phi_start[-1])
+    phi = np.empty((near_start[-1], kernels.BLOCK))
     reach = space.radius**2
 
     def fill_chunk(piece: slice) -> None:
         kernels.block_features(
             points, order, block_start, piece.start, piece.stop, *cells,
-            space.gamma, reach, near_start, phi_start, near, phi,
+            space.gamma, reach, near_start, near, phi,
         )  # fmt: skip
 
-    run_chunked(fill_chunk, blocks, 256)
-    return BlockFeatures(order, block_start, near_start, phi_start, near, phi)
+    run_chunked(fill_chunk, blocks, 512)
+    return BlockFeatures(order, block_start, near_start, near, phi)

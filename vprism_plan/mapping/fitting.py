@@ -168,7 +168,7 @@ def new_hinges(
 
 def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapConfig) -> Posterior:
     _check_hinge_count(space, config)
-    features = block_features(space, data.points, 0.4 * space.radius)
+    features = block_features(space, data.points)
     logger.info(
         "fitting %d points, %d hinge points, %d classes",
         len(data.points), len(space.hinges), prior.mean.shape[1],

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.linalg import solve_triangular
 from torch import Tensor
 
 from vprism_plan._kernels import mapping as kernels
@@ -18,8 +17,8 @@ from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior
-from vprism_plan.mapping.factors import cholesky, dense_class
-from vprism_plan.mapping.features import FeatureSpace, make_blocks
+from vprism_plan.mapping.factors import correlate, dense_class
+from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
@@ -162,10 +161,8 @@ class VPrismMap:
         size = self.space.size
         out = np.empty((n, size, self.n_classes))
         for k in range(self.n_classes):
-            factor = cholesky(dense_class(self.space, self.posterior.precision, k))
             noise = rng.standard_normal((size, n))
-            # precision = L L^T, so L^-T noise has the posterior covariance.
-            out[:, :, k] = solve_triangular(factor, noise, lower=True, trans="T").T
+            out[:, :, k] = correlate(self.space, self.posterior.precision, k, noise).T
         return out + self.posterior.mean
 
     # ------------------------------------------------------------------ learning, files
@@ -207,7 +204,7 @@ class VPrismMap:
         inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
         if len(inside) == 0:
             return mean, variance, support
-        order, block_start = make_blocks(points[inside], 0.4 * self.space.radius)
+        order, block_start = make_blocks(points[inside], block_extent(self.space))
         order = inside[order]
         space, posterior = self.space, self.posterior
 
@@ -218,7 +215,7 @@ class VPrismMap:
                 space.row_first, space.base, mean, variance, support,
             )  # fmt: skip
 
-        run_chunked(chunk, len(block_start) - 1, 64)
+        run_chunked(chunk, len(block_start) - 1, 512)
         return mean, variance, support
 
     def _evaluate(self, points: Any, question: Callable[..., Tensor]) -> Any:
