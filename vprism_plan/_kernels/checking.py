@@ -175,26 +175,31 @@ def within_limits(q, rf, ri):
 
 
 @njit(cache=True, nogil=True)
-def _link_clear(link, T, rf, ri, D, wf, margin, scratch):
+def _place_links(T, rf, ri, lc):
+    """Fill lc (n_links, 3) with the world centres of the links' bounding spheres."""
+    for link in range(ri[2]):
+        _transform(T, ri[ri[9] + 4 * link], rf, ri[18] + 4 * link, lc, link)
+
+
+@njit(cache=True, nogil=True)
+def _link_clear(link, T, lc, rf, ri, D, wf, margin, row):
     """Whether a link keeps more than `margin` from the world; its bounding sphere first."""
-    li = ri[9]
-    f = ri[li + 4 * link]
-    bo = ri[18] + 4 * link
-    _transform(T, f, rf, bo, scratch, 0)
-    x = scratch[0, 0]
-    y = scratch[0, 1]
-    z = scratch[0, 2]
-    need = margin + rf[bo + 3]
+    need = margin + rf[ri[18] + 4 * link + 3]
+    x = lc[link, 0]
+    y = lc[link, 1]
+    z = lc[link, 2]
     plane_ok = plane_bound(wf, x, y, z) > need
     field_ok = field_bound(D, wf, x, y, z, need) > need
     if plane_ok and field_ok:
         return True
+    li = ri[9] + 4 * link
     so = ri[17]
-    for s in range(ri[li + 4 * link + 1], ri[li + 4 * link + 2]):
-        _transform(T, f, rf, so + 4 * s, scratch, 0)
-        x = scratch[0, 0]
-        y = scratch[0, 1]
-        z = scratch[0, 2]
+    f = ri[li]
+    for s in range(ri[li + 1], ri[li + 2]):
+        _transform(T, f, rf, so + 4 * s, row, 0)
+        x = row[0, 0]
+        y = row[0, 1]
+        z = row[0, 2]
         need = margin + rf[so + 4 * s + 3]
         if not plane_ok and not plane_bound(wf, x, y, z) > need:
             return False
@@ -204,135 +209,150 @@ def _link_clear(link, T, rf, ri, D, wf, margin, scratch):
 
 
 @njit(cache=True, nogil=True)
-def _link_clearance(link, T, rf, ri, D, wf, enough, scratch):
+def _link_clearance(link, T, lc, rf, ri, D, wf, enough, row):
     """Lower bound of the distance from a link to the world, exact per sphere below `enough`.
 
     A sphere is never nearer than the link's bounding sphere, so each bound is the
     larger of the two: that keeps this consistent with `_link_clear`.
     """
-    li = ri[9]
-    f = ri[li + 4 * link]
-    bo = ri[18] + 4 * link
-    _transform(T, f, rf, bo, scratch, 0)
-    r = rf[bo + 3]
-    plane_all = plane_bound(wf, scratch[0, 0], scratch[0, 1], scratch[0, 2]) - r
-    field_all = field_bound(D, wf, scratch[0, 0], scratch[0, 1], scratch[0, 2], _INF) - r
+    r = rf[ri[18] + 4 * link + 3]
+    x = lc[link, 0]
+    y = lc[link, 1]
+    z = lc[link, 2]
+    plane_all = plane_bound(wf, x, y, z) - r
+    field_all = field_bound(D, wf, x, y, z, _INF) - r
     if min(plane_all, field_all) >= enough:
         return min(plane_all, field_all)
     best = _INF
+    li = ri[9] + 4 * link
     so = ri[17]
-    for s in range(ri[li + 4 * link + 1], ri[li + 4 * link + 2]):
-        _transform(T, f, rf, so + 4 * s, scratch, 0)
-        x = scratch[0, 0]
-        y = scratch[0, 1]
-        z = scratch[0, 2]
+    f = ri[li]
+    for s in range(ri[li + 1], ri[li + 2]):
+        _transform(T, f, rf, so + 4 * s, row, 0)
+        x = row[0, 0]
+        y = row[0, 1]
+        z = row[0, 2]
         r = rf[so + 4 * s + 3]
         plane = max(plane_bound(wf, x, y, z) - r, plane_all)
+        # Beyond the best so far a cheaper, smaller bound would do, but not the same number.
         field = max(field_bound(D, wf, x, y, z, _INF) - r, field_all)
         best = min(best, plane, field)
     return best
 
 
 @njit(cache=True, nogil=True)
-def _pair_gap(pair, T, rf, ri, enough, ca, cb):
-    """Lower bound of the gap between two links; exact over spheres below `enough`."""
-    li = ri[9]
+def _near_spheres(link, other, T, lc, rf, ri, enough, out):
+    """Collect a link's spheres that may come within `enough` of the other link's ball.
+
+    Fills rows of out with x, y, z, radius and returns how many.
+    """
+    li = ri[9] + 4 * link
+    so = ri[17]
+    f = ri[li]
+    ball = rf[ri[18] + 4 * other + 3] + enough
+    x = lc[other, 0]
+    y = lc[other, 1]
+    z = lc[other, 2]
+    n = 0
+    for s in range(ri[li + 1], ri[li + 2]):
+        _transform(T, f, rf, so + 4 * s, out, n)
+        r = rf[so + 4 * s + 3]
+        d2 = (out[n, 0] - x) ** 2 + (out[n, 1] - y) ** 2 + (out[n, 2] - z) ** 2
+        bound = r + ball
+        if d2 <= bound * bound:
+            out[n, 3] = r
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _pair_gap(pair, T, lc, rf, ri, enough, ca, cb):
+    """Gap between two links: exact if at most `enough`, else some value above `enough`."""
     a = ri[ri[10] + 2 * pair]
     b = ri[ri[10] + 2 * pair + 1]
-    fa = ri[li + 4 * a]
-    fb = ri[li + 4 * b]
     bo = ri[18]
-    _transform(T, fa, rf, bo + 4 * a, ca, 0)
-    _transform(T, fb, rf, bo + 4 * b, cb, 0)
-    d2 = (ca[0, 0] - cb[0, 0]) ** 2 + (ca[0, 1] - cb[0, 1]) ** 2 + (ca[0, 2] - cb[0, 2]) ** 2
+    d2 = (lc[a, 0] - lc[b, 0]) ** 2 + (lc[a, 1] - lc[b, 1]) ** 2 + (lc[a, 2] - lc[b, 2]) ** 2
     reach = rf[bo + 4 * a + 3] + rf[bo + 4 * b + 3]
     if d2 > (reach + enough) ** 2:
         return np.sqrt(d2) - reach
-    so = ri[17]
-    b0 = ri[li + 4 * b + 1]
-    b1 = ri[li + 4 * b + 2]
-    for s in range(b0, b1):
-        _transform(T, fb, rf, so + 4 * s, cb, s - b0)
-    best = _INF
-    wide = rf[bo + 4 * b + 3]
-    bx = T[fb, 0] * rf[bo + 4 * b] + T[fb, 1] * rf[bo + 4 * b + 1] + T[fb, 2] * rf[bo + 4 * b + 2]
-    by = T[fb, 3] * rf[bo + 4 * b] + T[fb, 4] * rf[bo + 4 * b + 1] + T[fb, 5] * rf[bo + 4 * b + 2]
-    bz = T[fb, 6] * rf[bo + 4 * b] + T[fb, 7] * rf[bo + 4 * b + 1] + T[fb, 8] * rf[bo + 4 * b + 2]
-    bx += T[fb, 9]
-    by += T[fb, 10]
-    bz += T[fb, 11]
-    for s in range(ri[li + 4 * a + 1], ri[li + 4 * a + 2]):
-        _transform(T, fa, rf, so + 4 * s, ca, 0)
-        x = ca[0, 0]
-        y = ca[0, 1]
-        z = ca[0, 2]
-        ra = rf[so + 4 * s + 3]
-        far = (x - bx) ** 2 + (y - by) ** 2 + (z - bz) ** 2
-        bound = ra + wide + min(enough, best)
-        if bound > 0.0 and far > bound * bound:
-            best = min(best, np.sqrt(far) - ra - wide)
-            continue
-        for t in range(b0, b1):
-            u = t - b0
-            d2 = (x - cb[u, 0]) ** 2 + (y - cb[u, 1]) ** 2 + (z - cb[u, 2]) ** 2
-            best = min(best, np.sqrt(d2) - ra - rf[so + 4 * t + 3])
+    na = _near_spheres(a, b, T, lc, rf, ri, enough, ca)
+    if na == 0:
+        return np.nextafter(enough, _INF)
+    nb = _near_spheres(b, a, T, lc, rf, ri, enough, cb)
+    la = ri[9] + 4 * a
+    lb = ri[9] + 4 * b
+    left_out = na < ri[la + 2] - ri[la + 1] or nb < ri[lb + 2] - ri[lb + 1]
+    best = np.nextafter(enough, _INF) if left_out else _INF
+    for s in range(na):
+        x = ca[s, 0]
+        y = ca[s, 1]
+        z = ca[s, 2]
+        ra = ca[s, 3]
+        for t in range(nb):
+            d2 = (x - cb[t, 0]) ** 2 + (y - cb[t, 1]) ** 2 + (z - cb[t, 2]) ** 2
+            bound = ra + cb[t, 3] + best
+            if bound < 0.0 or d2 < bound * bound:
+                best = min(best, np.sqrt(d2) - ra - cb[t, 3])
     return best
 
 
 @njit(cache=True, nogil=True)
-def _state_valid(q, rf, ri, D, wf, T, ca, cb):
+def _state_valid(q, rf, ri, D, wf, T, lc, ca, cb):
     if not within_limits(q, rf, ri):
         return False
     fk_frames(q, rf, ri, T)
+    _place_links(T, rf, ri, lc)
     margin = wf[6]
     li = ri[9]
     # Distal links first: the hand is what hits things.
     for link in range(ri[2] - 1, -1, -1):
-        if ri[li + 4 * link + 3] == 0 and not _link_clear(link, T, rf, ri, D, wf, margin, ca):
+        if ri[li + 4 * link + 3] == 0 and not _link_clear(link, T, lc, rf, ri, D, wf, margin, ca):
             return False
     self_margin = rf[ri[21]]
     for pair in range(ri[3]):
-        if not _pair_gap(pair, T, rf, ri, self_margin, ca, cb) > self_margin:
+        if not _pair_gap(pair, T, lc, rf, ri, self_margin, ca, cb) > self_margin:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
+def _scratch(ri):
+    """Room for frame poses, link centres, and the spheres of two links."""
+    most = ri[5]
+    return np.empty((ri[0], 12)), np.empty((ri[2], 3)), np.empty((most, 4)), np.empty((most, 4))
+
+
+@njit(cache=True, nogil=True)
 def is_valid(q, rf, ri, D, wf):
     """Whether a configuration is inside its limits and clear of the world and itself."""
-    most = ri[5]
-    return _state_valid(
-        q, rf, ri, D, wf, np.empty((ri[0], 12)), np.empty((1, 3)), np.empty((most, 3))
-    )
+    T, lc, ca, cb = _scratch(ri)
+    return _state_valid(q, rf, ri, D, wf, T, lc, ca, cb)
 
 
 @njit(cache=True, nogil=True)
 def is_valid_batch(Q, rf, ri, D, wf, out):
     """Fill out (n,) with `is_valid` of each row of Q (n, dof)."""
-    T = np.empty((ri[0], 12))
-    ca = np.empty((1, 3))
-    cb = np.empty((ri[5], 3))
+    T, lc, ca, cb = _scratch(ri)
     for n in range(Q.shape[0]):
-        out[n] = _state_valid(Q[n], rf, ri, D, wf, T, ca, cb)
+        out[n] = _state_valid(Q[n], rf, ri, D, wf, T, lc, ca, cb)
 
 
 @njit(cache=True, nogil=True)
 def clearance_batch(Q, rf, ri, D, wf, world, own):
     """Fill world (n,) and own (n,): distance bounds to the world and between links, metres."""
-    T = np.empty((ri[0], 12))
-    ca = np.empty((1, 3))
-    cb = np.empty((ri[5], 3))
+    T, lc, ca, cb = _scratch(ri)
     li = ri[9]
     for n in range(Q.shape[0]):
         fk_frames(Q[n], rf, ri, T)
+        _place_links(T, rf, ri, lc)
         best = _INF
         for link in range(ri[2]):
             if ri[li + 4 * link + 3] == 0:
-                best = min(best, _link_clearance(link, T, rf, ri, D, wf, best, ca))
+                best = min(best, _link_clearance(link, T, lc, rf, ri, D, wf, best, ca))
         world[n] = best
         gap = _INF
         for pair in range(ri[3]):
-            gap = min(gap, _pair_gap(pair, T, rf, ri, gap, ca, cb))
+            gap = min(gap, _pair_gap(pair, T, lc, rf, ri, gap, ca, cb))
         own[n] = gap
 
 
@@ -422,7 +442,7 @@ def motion_rates(delta, rf, ri, link_rate, pair_rate):
 
 
 @njit(cache=True, nogil=True)
-def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, ca, cb):
+def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, ca, cb):
     """How far along the edge (path parameter) a configuration's clearance reaches; < 0: invalid.
 
     Each link may move by its clearance, each pair by its gap, before anything can
@@ -431,6 +451,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, ca, cb):
     if not within_limits(q, rf, ri):
         return -1.0
     fk_frames(q, rf, ri, T)
+    _place_links(T, rf, ri, lc)
     margin = wf[6]
     li = ri[9]
     span = longest
@@ -438,7 +459,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, ca, cb):
         if ri[li + 4 * link + 3] != 0:
             continue
         rate = link_rate[link]
-        c = _link_clearance(link, T, rf, ri, D, wf, margin + span * rate, ca) - margin
+        c = _link_clearance(link, T, lc, rf, ri, D, wf, margin + span * rate, ca) - margin
         if not c > 0.0:
             return -1.0
         if c < span * rate:
@@ -446,7 +467,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, ca, cb):
     self_margin = rf[ri[21]]
     for pair in range(ri[3]):
         rate = pair_rate[pair]
-        g = _pair_gap(pair, T, rf, ri, self_margin + span * rate, ca, cb) - self_margin
+        g = _pair_gap(pair, T, lc, rf, ri, self_margin + span * rate, ca, cb) - self_margin
         if not g > 0.0:
             return -1.0
         if g < span * rate:
@@ -488,18 +509,16 @@ def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
     pair_rate = np.empty(ri[3])
     total = motion_rates(delta, rf, ri, link_rate, pair_rate)
     stats[3] = total
-    T = np.empty((ri[0], 12))
-    ca = np.empty((1, 3))
-    cb = np.empty((ri[5], 3))
+    T, lc, ca, cb = _scratch(ri)
     q = np.empty(dof)
     lo = np.empty(128)
     hi = np.empty(128)
-    span_a = _safe_span(qa, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, ca, cb)
+    span_a = _safe_span(qa, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, ca, cb)
     stats[1] = 1.0
     if span_a < 0.0:
         stats[0] = 0.0
         return False
-    span_b = _safe_span(qb, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, ca, cb)
+    span_b = _safe_span(qb, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, ca, cb)
     stats[1] = 2.0
     if span_b < 0.0:
         stats[0] = 1.0
@@ -518,7 +537,7 @@ def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
         t = 0.5 * (a + b)
         for j in range(dof):
             q[j] = qa[j] + t * delta[j]
-        span = _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, 0.5 * (b - a), T, ca, cb)
+        span = _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, ca, cb)
         stats[1] += 1.0
         if span < 0.0:
             stats[0] = t
