@@ -15,7 +15,6 @@ from vprism_plan.world.known import KnownMesh
 from vprism_plan.world.levelset import Cells, LevelSet
 
 _MAX_LATTICE = 400_000_000
-_CORNERS = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
 
 
 def _room(shape: Int[np.ndarray, " 3"], what: str) -> np.ndarray:
@@ -44,28 +43,15 @@ def rasterize_level_set(
     lower, upper = box
     labels = _room(upper - lower + 1, "the level set")
     for part in cells:
-        start = part.index - lower
-        if part.size > 1 or classes is not None:
-            kernels.fill_blocks(
-                labels, start, np.ascontiguousarray(part.labels[:, 0, 0, 0]), part.size
-            )
-            continue
-        for corner in _CORNERS:
-            node = start + corner
-            labels[node[:, 0], node[:, 1], node[:, 2]] = part.labels[
-                :, corner[0], corner[1], corner[2]
-            ]
+        kernels.fill_blocks(labels, part.index - lower, part.label, part.size)
     return Lattice(labels, lower, factor)
 
 
 def _owned(cells: Cells, classes: Collection[int]) -> Cells:
-    """Cells with one of the classes at some corner, relabelled with it."""
-    flat = cells.labels.reshape(len(cells.index), 8)
-    mine = np.isin(flat, np.array(sorted(classes), dtype=flat.dtype))
-    chosen = mine.any(axis=1)
-    label = np.where(mine, flat, 0).max(axis=1)[chosen]
-    spread = np.broadcast_to(label[:, None, None, None], (len(label), 2, 2, 2))
-    return Cells(cells.index[chosen], cells.size, np.ascontiguousarray(spread))
+    """Cells with one of the classes at some corner around them, relabelled with it."""
+    mine = np.isin(cells.around, np.array(sorted(classes), dtype=cells.around.dtype))
+    label = np.where(mine, cells.around, 0).max(axis=1, initial=0)
+    return Cells(cells.index, cells.size, label, cells.around).select(label > 0)
 
 
 def rasterize_mesh(known: KnownMesh, grid: Grid, factor: int) -> Lattice:
