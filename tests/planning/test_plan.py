@@ -166,15 +166,38 @@ def test_motions_accepted_wrongly_during_the_search_are_caught(planner):
         def check_motion(self, qa, qb):
             return super().check_motion_buffer(np.asarray(qa), np.asarray(qb))
 
-    honest = disk_world.wall_with_gap()
+    honest = disk_world.closed_wall()
     liar = Liar(honest.centers, honest.radii, honest.robot)
     result = plan(liar, START, GOAL, **quick(planner))
     assert result.status == "verification_failed"
     assert not result.solved
     assert result.path is None
     assert not edges_are_valid(honest, result.approximate_path)
+    assert result.report.searches == 5
     assert "on the way" in result.message
     assert result.explanation.valid is False
+
+
+def test_a_path_that_fails_its_verification_is_searched_for_again():
+    class LiesAtFirst(disk_world.DiskChecker):
+        lies = 8
+
+        def check_motion_buffer(self, qa, qb):
+            self.lies -= 1
+            return self.lies > 0 or super().check_motion_buffer(qa, qb)
+
+        def check_motion(self, qa, qb):
+            return super().check_motion_buffer(np.asarray(qa), np.asarray(qb))
+
+    honest = disk_world.wall_with_gap()
+    results = []
+    for _ in range(2):
+        checker = LiesAtFirst(honest.centers, honest.radii, honest.robot)
+        results.append(plan(checker, START, GOAL, time_limit=20.0))
+    assert results[0].solved
+    assert results[0].report.searches > 1
+    assert edges_are_valid(honest, results[0].path)
+    assert np.array_equal(results[0].path, results[1].path)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

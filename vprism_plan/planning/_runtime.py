@@ -11,7 +11,7 @@ from ompl import util as ou
 
 from vprism_plan.errors import PlanningError
 
-_MAX_SEED = 2**32 - 2
+MAX_SEED = 2**32 - 2
 _lock = threading.Lock()
 _quiet_depth = 0
 _saved_level: Any = None
@@ -54,6 +54,6 @@ def seed_ompl(seed: int) -> None:
 def checked_seed(seed: Any) -> int:
     """Return the seed as an int; raise PlanningError unless it is an integer from 0."""
     whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    if not whole or not 0 <= seed <= _MAX_SEED:
-        raise PlanningError(f"seed is {seed!r}; it must be an integer from 0 to {_MAX_SEED}")
+    if not whole or not 0 <= seed <= MAX_SEED:
+        raise PlanningError(f"seed is {seed!r}; it must be an integer from 0 to {MAX_SEED}")
     return int(seed)

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 from ompl import base as ob
-from ompl import geometric as og
 
 from vprism_plan.planning._planners import (
     CostConvergence,
@@ -31,7 +30,6 @@ from vprism_plan.planning.ompl_adapter import (
     shortest_step,
 )
 
-_SIMPLIFY_ROUNDS = 10
 _GOAL_TOLERANCE = 1e-9
 
 
@@ -43,8 +41,6 @@ class SearchRequest:
     time_limit: float
     seed: int
     stop: str
-    simplify: bool
-    simplify_time: float
     step: float | None
     convergence: tuple[float, int]
 
@@ -57,7 +53,6 @@ class SearchOutcome:
     path: np.ndarray | None
     goal_index: int | None
     planning_time: float
-    simplification_time: float
     state_checks: int
     motion_checks: int
 
@@ -98,15 +93,12 @@ def search(
             claimed = status == ob.PlannerStatus.EXACT_SOLUTION and problem.hasExactSolution()
             # OMPL calls approximate solutions "solved"; the last state decides.
             verdict = "exact" if claimed and goal_index is not None else "approximate"
-            if verdict == "exact" and request.simplify:
-                _simplify(si, solution, planned + request.simplify_time)
             path = _waypoints(reader, solution)
         return SearchOutcome(
             status=verdict,
             path=path,
             goal_index=goal_index,
             planning_time=planned - began,
-            simplification_time=time.perf_counter() - planned,
             state_checks=states.checks,
             motion_checks=motions.checks,
         )
@@ -164,24 +156,6 @@ def _reached(reader: StateReader, solution: Any, goals: Float[np.ndarray, "g dof
     worst = np.max(np.abs(gaps - turns), axis=1)
     best = int(np.argmin(worst))
     return best if worst[best] <= _GOAL_TOLERANCE else None
-
-
-def _simplify(si: Any, path: Any, deadline: float) -> None:
-    """Shorten a path with motions the validator accepts, until nothing improves.
-
-    Rounds are counted and each is seeded, so only a deadline that strikes makes the
-    result depend on the speed of the machine.
-    """
-    simplifier = og.PathSimplifier(si)
-    for _ in range(_SIMPLIFY_ROUNDS):
-        before, count = path.length(), path.getStateCount()
-        simplifier.reduceVertices(path)
-        simplifier.partialShortcutPath(path)
-        simplifier.collapseCloseVertices(path)
-        settled = path.length() > 0.999 * before and path.getStateCount() >= count
-        if settled or time.perf_counter() > deadline:
-            break
-    simplifier.reduceVertices(path)
 
 
 def _waypoints(reader: StateReader, path: Any) -> Float[np.ndarray, "t dof"]:

@@ -12,14 +12,58 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.planning._protocol import CheckerLike
-from vprism_plan.planning.ompl_adapter import check_straight
+from vprism_plan.planning._shortcut import Check
+from vprism_plan.planning.ompl_adapter import check_straight, straight_pieces
 from vprism_plan.planning.result import PlanReport, PlanResult
 
 _log = logging.getLogger(__name__)
 
 
+class MotionCheck:
+    """Counts and answers `checker.check_motion` for edges that may become part of a path.
+
+    An edge that turns a continuous joint by half a turn or more is refused: whoever
+    follows the path could take it for the shorter way round.
+    """
+
+    def __init__(self, checker: CheckerLike) -> None:
+        self._check = checker.check_motion
+        self._turns = np.asarray(checker.robot.continuous, dtype=bool)
+        self.count = 0
+
+    def __call__(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> bool:
+        self.count += 1
+        if np.any(np.abs(qb - qa)[self._turns] >= np.pi):
+            return False
+        return check_straight(self._check, qa, qb, self._turns)
+
+
+def resample(
+    path: Float[np.ndarray, "t dof"], check: Check, spacing: float
+) -> Float[np.ndarray, "n dof"]:
+    """Insert equally spaced waypoints on edges longer than `spacing`.
+
+    The pieces of an edge that was accepted within a tolerance may not all pass by
+    themselves; such an edge stays whole.
+    """
+    rows = [path[0]]
+    for edge in pairwise(path):
+        pieces = interpolated(np.stack(edge), spacing)
+        split = all(check(a, b) for a, b in pairwise(pieces))
+        rows += list(pieces[1:]) if split else [edge[1]]
+    return np.stack(rows)
+
+
+def split_turns(path: Float[np.ndarray, "t dof"], turns: Any) -> Float[np.ndarray, "n dof"]:
+    """Add waypoints where a continuous joint turns so far that its direction is unclear."""
+    rows = [path[:1]]
+    for a, b in pairwise(path):
+        rows.append(np.stack(straight_pieces(a, b, turns)[1:]))
+    return np.concatenate(rows)
+
+
 def interpolated(path: Float[np.ndarray, "t dof"], spacing: float) -> Float[np.ndarray, "n dof"]:
-    """Insert equally spaced waypoints on every edge longer than `spacing`."""
+    """Return the path with points at most `spacing` apart."""
     pieces = [path[:1]]
     for a, b in pairwise(path):
         n = max(1, math.ceil(float(np.linalg.norm(b - a)) / spacing))

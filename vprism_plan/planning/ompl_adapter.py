@@ -122,20 +122,25 @@ def shortest_step(
     return step
 
 
-def check_straight(
-    check_motion: Any, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], turns: Any
-) -> bool:
-    """Check the straight line from qa to qb however far its continuous joints turn.
+def straight_pieces(
+    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], turns: Any
+) -> list[np.ndarray]:
+    """Return points of the line from qa to qb between which no joint turns very far.
 
     A checker may or may not take the shorter way round; pieces of less than half a
     turn leave it no choice. `turns` marks the joints this concerns.
     """
     widest = float(np.max(np.abs(qb - qa), where=turns, initial=0.0))
     pieces = max(1, math.ceil(widest / _UNAMBIGUOUS_TURN))
-    if pieces == 1:
-        return bool(check_motion(qa, qb))
-    corners = [qa + (qb - qa) * (k / pieces) for k in range(pieces)] + [qb]
-    return all(bool(check_motion(a, b)) for a, b in pairwise(corners))
+    return [qa + (qb - qa) * (k / pieces) if k else qa for k in range(pieces)] + [qb]
+
+
+def check_straight(
+    check_motion: Any, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], turns: Any
+) -> bool:
+    """Check the straight line from qa to qb however far its continuous joints turn."""
+    points = straight_pieces(qa, qb, turns)
+    return all(bool(check_motion(a, b)) for a, b in pairwise(points))
 
 
 def last_valid(

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`plan`: one query, one honest answer."""
 
-import math
+import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,18 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning._planners import planner_kind
 from vprism_plan.planning._protocol import CheckerLike
-from vprism_plan.planning._runtime import checked_seed
+from vprism_plan.planning._query import configuration, refuse, search_request, valid_goals
+from vprism_plan.planning._runtime import MAX_SEED
 from vprism_plan.planning._search import SearchRequest, search
-from vprism_plan.planning._verify import interpolated, one_line, verified
-from vprism_plan.planning.goals import PoseGoalConfig, configurations_at_pose
+from vprism_plan.planning._shortcut import shorten
+from vprism_plan.planning._verify import MotionCheck, resample, split_turns, verified
+from vprism_plan.planning.goals import PoseGoalConfig
 from vprism_plan.planning.ompl_adapter import check_straight, shortest_step
 from vprism_plan.planning.result import PlanReport, PlanResult
+
+_ATTEMPTS = 5
+_SEED_STRIDE = 0x9E3779B1
 
 
 def plan(
@@ -64,7 +68,8 @@ def plan(
         step: length of the planner's steps in the metric of the space; OMPL's choice
             (a fifth of the space's extent) if None.
         interpolate: largest distance between waypoints of the result, Euclidean in
-            joint space; no waypoints are added if None.
+            joint space; no waypoints are added if None. An edge whose pieces do not all
+            pass the check by themselves stays whole.
         clearance_step: distance between the samples of the reported clearance.
         pose_goal: how a pose is turned into configurations.
 
@@ -74,160 +79,110 @@ def plan(
     Raises:
         PlanningError: for a malformed query, naming the value and the valid ones.
     """
-    request = _request(planner, time_limit, seed, stop, convergence, simplify, simplify_time, step)
+    request = search_request(planner, time_limit, seed, stop, convergence, step)
     for name, value in (("interpolate", interpolate), ("clearance_step", clearance_step)):
         if value is not None and not value > 0.0:
             raise PlanningError(f"{name} is {value!r}; it must be more than 0")
-    q_start = _configuration(start, checker.robot, "start")
+    if not simplify_time >= 0.0:
+        raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
+    q_start = configuration(start, checker.robot, "start")
     report = PlanReport(planner=planner, seed=request.seed, time_limit=request.time_limit)
 
-    refusal = _refuse(checker, q_start, "start", report)
+    refusal = refuse(checker, q_start, "start", report)
     if refusal is not None:
         return refusal
-    goals = _goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
+    goals = valid_goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
     if isinstance(goals, PlanResult):
         return goals
     report = replace(report, state_checks=1 + len(goals))
 
+    finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step)
     direct = _direct(checker, q_start, goals)
+    report = replace(report, motion_checks=len(goals))
     if direct is not None:
         index, path = direct
-        report = replace(
-            report, direct=True, goal_index=index, motion_checks=report.motion_checks + index + 1
+        report = replace(report, direct=True, goal_index=index)
+        return verified(checker, finish.resampled(checker, path), clearance_step, report)
+    return _searched(checker, q_start, goals, request, finish, report)
+
+
+@dataclass(frozen=True)
+class _Finish:
+    """What happens to a path between the search and its verification."""
+
+    simplify: bool
+    simplify_time: float
+    interpolate: float | None
+    clearance_step: float
+
+    def shortened(
+        self, checker: CheckerLike, path: Float[np.ndarray, "t dof"], report: PlanReport
+    ) -> tuple[Float[np.ndarray, "n dof"], PlanReport]:
+        """Return the path with fewer detours, and the report with what that took."""
+        if not self.simplify:
+            return path, report
+        began = time.perf_counter()
+        check = MotionCheck(checker)
+        path = shorten(path, check, report.seed, began + self.simplify_time)
+        return path, replace(
+            report,
+            simplification_time=report.simplification_time + time.perf_counter() - began,
+            motion_checks=report.motion_checks + check.count,
         )
-    else:
-        found = search(checker, q_start, goals, request)
+
+    def resampled(
+        self, checker: CheckerLike, path: Float[np.ndarray, "t dof"]
+    ) -> Float[np.ndarray, "n dof"]:
+        """Return the path with the waypoints that were asked for."""
+        path = split_turns(path, np.asarray(checker.robot.continuous, dtype=bool))
+        if self.interpolate is None:
+            return path
+        return resample(path, MotionCheck(checker), self.interpolate)
+
+
+def _searched(
+    checker: CheckerLike,
+    start: Float[np.ndarray, " dof"],
+    goals: Float[np.ndarray, "g dof"],
+    request: SearchRequest,
+    finish: _Finish,
+    report: PlanReport,
+) -> PlanResult:
+    """Search, shorten and verify; search again with another seed if verification fails.
+
+    A checker that samples at its finest step can accept an edge in one direction and
+    refuse it in the other, by microns. Bidirectional planners turn edges round.
+    """
+    refused: PlanResult | None = None
+    for attempt in range(_ATTEMPTS):
+        left = request.time_limit - report.planning_time
+        if left <= 0.0:
+            break
+        seed = (request.seed + attempt * _SEED_STRIDE) % (MAX_SEED + 1)
+        found = search(checker, start, goals, replace(request, seed=seed, time_limit=left))
         report = replace(
             report,
-            planning_time=found.planning_time,
-            simplification_time=found.simplification_time,
+            searches=attempt + 1,
+            planning_time=report.planning_time + found.planning_time,
             state_checks=report.state_checks + found.state_checks,
-            motion_checks=report.motion_checks + len(goals) + found.motion_checks,
-            goal_index=found.goal_index if found.status == "exact" else None,
+            motion_checks=report.motion_checks + found.motion_checks,
         )
         if found.status != "exact" or found.path is None:
-            return _not_found(found.status, found.path, report)
-        path = found.path
-    # Wrapping moved the start to [-pi, pi); give the caller's own turns back.
-    path = path + (q_start - path[0])
-    path[0] = q_start
-    if interpolate is not None:
-        path = interpolated(path, interpolate)
-    return verified(checker, path, clearance_step, report)
-
-
-def _request(
-    planner: str,
-    time_limit: float | int,
-    seed: int,
-    stop: str,
-    convergence: tuple[float, int],
-    simplify: bool,
-    simplify_time: float,
-    step: float | None,
-) -> SearchRequest:
-    planner_kind(planner)
-    if not (math.isfinite(time_limit) and time_limit > 0):
-        raise PlanningError(f"time_limit is {time_limit!r} s; it must be finite and more than 0")
-    if stop not in ("limit", "first", "converged"):
-        raise PlanningError(f"stop is {stop!r}; valid values are 'limit', 'first', 'converged'")
-    tolerance, patience = convergence
-    if not (0.0 < tolerance < 1.0 and patience >= 1):
-        raise PlanningError(
-            f"convergence is {convergence!r}; it must be (tolerance in (0, 1), patience of "
-            "at least 1 iteration)"
+            return refused or _not_found(found.status, found.path, report)
+        # Wrapping moved the start to [-pi, pi); give the caller's own turns back.
+        path = found.path + (start - found.path[0])
+        path[0] = start
+        path, report = finish.shortened(checker, path, report)
+        path = finish.resampled(checker, path)
+        result = verified(
+            checker, path, finish.clearance_step, replace(report, goal_index=found.goal_index)
         )
-    if not simplify_time >= 0.0:
-        raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
-    if step is not None and not (math.isfinite(step) and step > 0.0):
-        raise PlanningError(f"step is {step!r}; it must be finite and more than 0, or None")
-    return SearchRequest(
-        planner=planner,
-        time_limit=float(time_limit),
-        seed=checked_seed(seed),
-        stop=stop,
-        simplify=simplify,
-        simplify_time=float(simplify_time),
-        step=None if step is None else float(step),
-        convergence=(float(tolerance), int(patience)),
-    )
-
-
-def _configuration(q: Any, robot: Any, what: str) -> Float[np.ndarray, " dof"]:
-    """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
-    array = np.array(q, dtype=np.float64)
-    if array.shape != (robot.dof,):
-        raise PlanningError(
-            f"{what} has shape {array.shape}; it must be ({robot.dof},), one value per joint: "
-            f"{', '.join(robot.joint_names)}"
-        )
-    if not np.isfinite(array).all():
-        raise PlanningError(f"{what} is {array}; every joint value must be finite")
-    return array
-
-
-def _outside_limits(robot: Any, q: Float[np.ndarray, " dof"]) -> str:
-    """Name the joints of q that are outside their limits, empty if none is."""
-    bad = ~np.asarray(robot.continuous, dtype=bool) & ((q < robot.lower) | (q > robot.upper))
-    return ", ".join(
-        f"joint {robot.joint_names[i]} is {q[i]:.6g}, outside [{robot.lower[i]:.6g}, "
-        f"{robot.upper[i]:.6g}]"
-        for i in np.flatnonzero(bad)
-    )
-
-
-def _refuse(
-    checker: CheckerLike, q: Float[np.ndarray, " dof"], what: str, report: PlanReport
-) -> PlanResult | None:
-    """Return the refusal if q must not be used as start or goal, None if it may."""
-    outside = _outside_limits(checker.robot, q)
-    if not outside and checker.is_valid(q):
-        return None
-    explanation = checker.explain(q)
-    # The limits are checked here too: outside them OMPL would refuse without a reason.
-    reasons = outside if explanation.valid else one_line(explanation)
-    status: Any = f"invalid_{what}"
-    return PlanResult(
-        path=None,
-        status=status,
-        report=report,
-        message=f"{what} is invalid: {reasons}",
-        explanation=explanation,
-    )
-
-
-def _goals(
-    checker: CheckerLike,
-    goal: Any,
-    start: Float[np.ndarray, " dof"],
-    pose_goal: PoseGoalConfig,
-    report: PlanReport,
-) -> np.ndarray | PlanResult:
-    """Return valid goal configurations (g, dof), or the refusal."""
-    array = np.asarray(goal, dtype=np.float64)
-    if array.shape != (4, 4):
-        q = _configuration(array, checker.robot, "goal")
-        refusal = _refuse(checker, q, "goal", report)
-        return q[None] if refusal is None else refusal
-    found = configurations_at_pose(checker, array, start, report.seed, pose_goal)
-    if len(found.valid):
-        return found.valid
-    if found.example is None:
-        return PlanResult(
-            path=None,
-            status="invalid_goal",
-            report=report,
-            message="goal is invalid: no configuration within the joint limits reaches the pose "
-            f"({found.attempts} attempts)",
-        )
-    refusal = _refuse(checker, found.example, "goal", report)
-    if refusal is None:
-        raise PlanningError("the checker changed its verdict on a goal configuration")
-    return replace(
-        refusal,
-        message=f"all {found.reached} configurations found for the goal pose are invalid, "
-        f"the first: {refusal.message.removeprefix('goal is invalid: ')}",
-    )
+        if result.solved:
+            return result
+        refused, report = result, result.report
+    if refused is None:
+        raise PlanningError(f"time_limit {request.time_limit} s left no time for a search")
+    return refused
 
 
 def _direct(

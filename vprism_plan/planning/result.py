@@ -31,6 +31,8 @@ class PlanReport:
             metres, NaN without a path. A sampled value: the path's safety rests on the
             continuous re-verification, not on it.
         clearance_samples: number of those samples.
+        searches: how often the planner ran; more than once if a path it accepted failed
+            verification, each time with another seed derived from the given one.
         direct: whether the straight motion to the goal was valid, so that no search ran.
         goal_index: which of several goal configurations (solutions of a pose) was
             reached, None if none was.
@@ -55,6 +57,7 @@ class PlanReport:
     waypoints: int = 0
     min_clearance: float = float("nan")
     clearance_samples: int = 0
+    searches: int = 0
     direct: bool = False
     goal_index: int | None = None
     certified: bool = False

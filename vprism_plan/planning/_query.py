@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a query must be before a search is worth while."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.errors import PlanningError
+from vprism_plan.planning._planners import planner_kind
+from vprism_plan.planning._protocol import CheckerLike
+from vprism_plan.planning._runtime import checked_seed
+from vprism_plan.planning._search import SearchRequest
+from vprism_plan.planning._verify import one_line
+from vprism_plan.planning.goals import PoseGoalConfig, configurations_at_pose
+from vprism_plan.planning.result import PlanReport, PlanResult
+
+
+def search_request(
+    planner: str,
+    time_limit: float | int,
+    seed: int,
+    stop: str,
+    convergence: tuple[float, int],
+    step: float | None,
+) -> SearchRequest:
+    """Check the parameters of the search; raise PlanningError naming the first bad one."""
+    planner_kind(planner)
+    if not (math.isfinite(time_limit) and time_limit > 0):
+        raise PlanningError(f"time_limit is {time_limit!r} s; it must be finite and more than 0")
+    if stop not in ("limit", "first", "converged"):
+        raise PlanningError(f"stop is {stop!r}; valid values are 'limit', 'first', 'converged'")
+    tolerance, patience = convergence
+    if not (0.0 < tolerance < 1.0 and patience >= 1):
+        raise PlanningError(
+            f"convergence is {convergence!r}; it must be (tolerance in (0, 1), patience of "
+            "at least 1 iteration)"
+        )
+    if step is not None and not (math.isfinite(step) and step > 0.0):
+        raise PlanningError(f"step is {step!r}; it must be finite and more than 0, or None")
+    return SearchRequest(
+        planner=planner,
+        time_limit=float(time_limit),
+        seed=checked_seed(seed),
+        stop=stop,
+        step=None if step is None else float(step),
+        convergence=(float(tolerance), int(patience)),
+    )
+
+
+def configuration(q: Any, robot: Any, what: str) -> Float[np.ndarray, " dof"]:
+    """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
+    array = np.array(q, dtype=np.float64)
+    if array.shape != (robot.dof,):
+        raise PlanningError(
+            f"{what} has shape {array.shape}; it must be ({robot.dof},), one value per joint: "
+            f"{', '.join(robot.joint_names)}"
+        )
+    if not np.isfinite(array).all():
+        raise PlanningError(f"{what} is {array}; every joint value must be finite")
+    return array
+
+
+def _outside_limits(robot: Any, q: Float[np.ndarray, " dof"]) -> str:
+    """Name the joints of q that are outside their limits, empty if none is."""
+    bad = ~np.asarray(robot.continuous, dtype=bool) & ((q < robot.lower) | (q > robot.upper))
+    return ", ".join(
+        f"joint {robot.joint_names[i]} is {q[i]:.6g}, outside [{robot.lower[i]:.6g}, "
+        f"{robot.upper[i]:.6g}]"
+        for i in np.flatnonzero(bad)
+    )
+
+
+def refuse(
+    checker: CheckerLike, q: Float[np.ndarray, " dof"], what: str, report: PlanReport
+) -> PlanResult | None:
+    """Return the refusal if q must not be used as start or goal, None if it may."""
+    outside = _outside_limits(checker.robot, q)
+    if not outside and checker.is_valid(q):
+        return None
+    explanation = checker.explain(q)
+    # The limits are checked here too: outside them OMPL would refuse without a reason.
+    reasons = outside if explanation.valid else one_line(explanation)
+    status: Any = f"invalid_{what}"
+    return PlanResult(
+        path=None,
+        status=status,
+        report=report,
+        message=f"{what} is invalid: {reasons}",
+        explanation=explanation,
+    )
+
+
+def valid_goals(
+    checker: CheckerLike,
+    goal: Any,
+    start: Float[np.ndarray, " dof"],
+    pose_goal: PoseGoalConfig,
+    report: PlanReport,
+) -> np.ndarray | PlanResult:
+    """Return valid goal configurations (g, dof), or the refusal."""
+    array = np.asarray(goal, dtype=np.float64)
+    if array.shape != (4, 4):
+        q = configuration(array, checker.robot, "goal")
+        refusal = refuse(checker, q, "goal", report)
+        return q[None] if refusal is None else refusal
+    found = configurations_at_pose(checker, array, start, report.seed, pose_goal)
+    if len(found.valid):
+        return found.valid
+    if found.example is None:
+        return PlanResult(
+            path=None,
+            status="invalid_goal",
+            report=report,
+            message="goal is invalid: no configuration within the joint limits reaches the pose "
+            f"({found.attempts} attempts)",
+        )
+    refusal = refuse(checker, found.example, "goal", report)
+    if refusal is None:
+        raise PlanningError("the checker changed its verdict on a goal configuration")
+    return replace(
+        refusal,
+        message=f"all {found.reached} configurations found for the goal pose are invalid, "
+        f"the first: {refusal.message.removeprefix('goal is invalid: ')}",
+    )

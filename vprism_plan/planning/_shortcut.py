@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Shortening a path so that every edge of the result was itself checked.
+
+OMPL's `PathSimplifier` cuts accepted edges at points of its choice and keeps the
+pieces unchecked. A checker that samples at its finest step may refuse such a piece by
+microns, and the final verification then refuses the path. Here an edge enters the path
+only as it will be verified: same ends, same direction.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+Check = Callable[[np.ndarray, np.ndarray], bool]
+
+_MOST_CUTS = 120
+_FUTILE_CUTS = 25
+# Ends of a cut this near to a waypoint, as a share of the path, are moved onto it.
+_SNAP = 0.02
+_WORTHWHILE = 1e-6
+
+
+def shorten(
+    path: Float[np.ndarray, "t dof"], check: Check, seed: int, deadline: float
+) -> Float[np.ndarray, "n dof"]:
+    """Shorten a path by dropping waypoints and by random cuts (Geraerts and Overmars 2007).
+
+    Args:
+        path: waypoints (t, dof), consecutive rows joined by straight motions.
+        check: whether a straight motion is valid.
+        seed: of the random cuts; the result depends on the clock only if the deadline
+            strikes.
+        deadline: value of `time.perf_counter` after which no cut is tried.
+
+    Returns:
+        Waypoints with the same ends. Edges that were not in `path` passed `check`.
+    """
+    rng = np.random.default_rng(seed)
+    path = drop_waypoints(path, check, deadline)
+    futile = 0
+    for _ in range(_MOST_CUTS):
+        if len(path) < 3 or futile >= _FUTILE_CUTS or time.perf_counter() > deadline:
+            break
+        cut = _cut(path, check, rng)
+        futile = futile + 1 if cut is None else 0
+        path = path if cut is None else cut
+    return drop_waypoints(path, check, deadline)
+
+
+def drop_waypoints(
+    path: Float[np.ndarray, "t dof"], check: Check, deadline: float
+) -> Float[np.ndarray, "n dof"]:
+    """Connect each kept waypoint to the furthest one it reaches in a straight line."""
+    kept = [0]
+    last = len(path) - 1
+    while kept[-1] < last:
+        here = kept[-1]
+        reached = here + 1
+        for ahead in range(last, here + 1, -1):
+            if time.perf_counter() > deadline:
+                break
+            if check(path[here], path[ahead]):
+                reached = ahead
+                break
+        kept.append(reached)
+    return path[kept]
+
+
+def _cut(
+    path: Float[np.ndarray, "t dof"], check: Check, rng: np.random.Generator
+) -> Float[np.ndarray, "n dof"] | None:
+    """Try to replace the path between two random points of it by a straight motion."""
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    first, second = np.sort(rng.uniform(0.0, along[-1], 2))
+    i, a, first = _point(path, along, float(first))
+    j, b, second = _point(path, along, float(second))
+    if i == j:
+        return None
+    start = path[i] if a is None else a
+    end = path[j] if b is None else b
+    gain = second - first - float(np.linalg.norm(end - start))
+    if gain < _WORTHWHILE * along[-1] or not check(start, end):
+        return None
+    # Splitting an accepted edge makes new edges: they have to pass by themselves.
+    if a is not None and not check(path[i], a):
+        return None
+    if b is not None and not check(b, path[j + 1]):
+        return None
+    rest = path[j:] if b is None else path[j + 1 :]
+    middle = [q[None] for q in (a, b) if q is not None]
+    return np.concatenate([path[: i + 1], *middle, rest])
+
+
+def _point(
+    path: Float[np.ndarray, "t dof"], along: Float[np.ndarray, " t"], s: float
+) -> tuple[int, Float[np.ndarray, " dof"] | None, float]:
+    """Return the edge that holds arc length s, the point there, and s.
+
+    Near a waypoint: its index, None, and its arc length.
+    """
+    nearest = int(np.argmin(np.abs(along - s)))
+    if abs(along[nearest] - s) <= _SNAP * along[-1]:
+        return nearest, None, float(along[nearest])
+    edge = int(np.searchsorted(along, s, side="right")) - 1
+    share = (s - along[edge]) / (along[edge + 1] - along[edge])
+    return edge, path[edge] + share * (path[edge + 1] - path[edge]), s
