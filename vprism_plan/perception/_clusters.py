@@ -18,7 +18,7 @@ from vprism_plan.perception.plane import Plane
 _REACH = 0.015
 # A fragment is at most this share of what it is joined to.
 _FRAGMENT = 0.25
-_CONTACT = 0.2
+_CONTACT = 0.1
 _MIN_FRAGMENT = 1e-4
 # Share of a cluster's footprint inside another's hull that makes it a part of the other.
 _INSIDE = 0.7
@@ -109,7 +109,7 @@ def _join_fragments(
     candidates = np.flatnonzero(area > _MIN_FRAGMENT)
     order = candidates[np.argsort(-area[candidates], kind="stable")]
     members = {c: points[clusters == c] for c in order.tolist()}
-    noise = {c: float(depth_noise(np.median(image.depth[clusters == c]))) for c in members}
+    noise = {c: float(np.median(depth_noise(image.depth[clusters == c]))) for c in members}
     axes = plane.axes()
     owner = np.arange(len(area))
     for position, big in enumerate(order.tolist()):
@@ -130,7 +130,7 @@ def _join_fragments(
 
 
 def _touch(big: Float[np.ndarray, "n 3"], small: Float[np.ndarray, "m 3"], reach: float) -> bool:
-    """Whether a fifth of the small cluster lies within reach of the big one."""
+    """Whether a tenth of the small cluster lies within reach of the big one."""
     from scipy.spatial import cKDTree
 
     lower, upper = small.min(axis=0) - reach, small.max(axis=0) + reach

@@ -20,6 +20,7 @@ _HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
 _LINK_SLANT = 75.0
 _FLYING_SLANT = 78.0
 _CUT_SLANT = 70.0
+_MAX_RAMP = 3
 # Along a step in depth between two objects height changes too; on a table top or the
 # lid of a box it does not, however obliquely it is seen.
 _LEVEL = 0.15
@@ -110,24 +111,41 @@ def components(
 def flying_pixels(image: SurfaceImage) -> Bool[np.ndarray, "h w"]:
     """Find pixels that hang in the air between a near and a far surface.
 
-    Stereo and time-of-flight cameras blend the two sides of an edge into a ramp along
-    the line of sight: in some direction depth jumps the same way on both sides of such a
-    pixel. A pixel with fewer than two of its eight neighbours on its own surface is a
-    speck and counts too. Pixels at a clean edge have one side on their surface and stay.
+    Stereo and time-of-flight cameras blend the two sides of an edge into a short ramp
+    along the line of sight: in some direction depth jumps the same way on both sides of
+    such a pixel. A ramp of more than three pixels may be the side of a box seen at a
+    glancing angle and stays. A pixel with fewer than two of its eight neighbours on its
+    own surface is a speck and counts too. Pixels at a clean edge have one side on their
+    surface and stay.
     """
-    valid_pixel = image.depth > 0
-    near = np.zeros(image.depth.shape, dtype=np.int8)
-    ramp = np.zeros(image.depth.shape, dtype=bool)
-    for here, there, valid, step in image.pairs(1, _FLYING_SLANT):
+    from scipy import ndimage
+
+    shape = image.depth.shape
+    near = np.zeros(shape, dtype=np.int8)
+    ramp = np.zeros(shape, dtype=bool)
+    for (here, there, valid, step), line in zip(
+        image.pairs(1, _FLYING_SLANT), _lines(_MAX_RAMP + 1), strict=True
+    ):
         close = valid & (step == 0)
         near[here] += close
         near[there] += close
-        ahead = np.zeros(image.depth.shape, dtype=np.int8)
-        behind = np.zeros(image.depth.shape, dtype=np.int8)
+        ahead, behind = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=np.int8)
         ahead[here] = step
         behind[there] = step
-        ramp |= (ahead != 0) & (ahead == behind)
-    return np.asarray(valid_pixel & (ramp | (near < 2)))
+        steep = (ahead != 0) & (ahead == behind)
+        ramp |= steep & ~ndimage.binary_opening(steep, structure=line)
+    return np.asarray((image.depth > 0) & (ramp | (near < 2)))
+
+
+def _lines(length: int) -> list[Bool[np.ndarray, "r c"]]:
+    """Lines of pixels along the four directions of `_HALF`."""
+    diagonal = np.eye(length, dtype=bool)
+    return [
+        np.ones((1, length), dtype=bool),
+        np.ones((length, 1), dtype=bool),
+        diagonal,
+        diagonal[:, ::-1],
+    ]
 
 
 def jump_pixels(image: SurfaceImage, reach: int = 2) -> Bool[np.ndarray, "h w"]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vprism_plan.errors import PlaneNotFoundError
 from vprism_plan.perception.plane import Plane
 
 _CELL = 0.02
@@ -43,6 +44,11 @@ def table_region(plane: Plane, on_plane: Float[np.ndarray, "n 3"]) -> TableRegio
 
     A chair seat or a second desk may happen to lie in the same plane: of the patches more
     than 10 cm apart, those with less than a fifth of the largest one's points are left out.
+    So are strips thinner than 6 cm, where a chair's back beside the table passes through
+    the plane.
+
+    Raises:
+        PlaneNotFoundError: the points cover no patch of 6 cm x 6 cm.
     """
     from scipy import ndimage
     from scipy.spatial import ConvexHull
@@ -55,6 +61,11 @@ def table_region(plane: Plane, on_plane: Float[np.ndarray, "n 3"]) -> TableRegio
     lower = cells.min(axis=0) - _BRIDGE
     grid = np.zeros(cells.max(axis=0) - lower + _BRIDGE + 1, dtype=bool)
     grid[tuple((cells - lower).T)] = True
+    grid &= ndimage.binary_opening(ndimage.binary_closing(grid), np.ones((3, 3), dtype=bool))
+    if not grid.any():
+        raise PlaneNotFoundError(
+            "the points on the support plane cover no patch of 6 cm x 6 cm; is it the right plane?"
+        )
     patches, count = ndimage.label(ndimage.binary_closing(grid, iterations=_BRIDGE))
     patches[~grid] = 0
     pixels = np.bincount(patches[tuple((cells - lower).T)], minlength=count + 1)

@@ -6,6 +6,7 @@ millimetres are divided by 1000.
 """
 
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,16 @@ from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
 _NPZ_KEYS = ("depth", "labels", "intrinsics", "T_world_camera", "color", "plane")
+# What numpy, zipfile and zlib raise on a damaged archive.
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 _FORMS = (
     "a .npz file, a folder with depth.png and camera.json, a BOP scene folder with "
     "scene_camera.json, or a depth image named *depth.png with camera.json beside it"
@@ -71,14 +82,15 @@ def _named(source: Path, load: Any) -> Observation:
 
 def _load_npz(path: Path) -> Observation:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not hasattr(archive, "files"):
-                raise ObservationError("is a bare .npy array; save it with np.savez")
+        with path.open("rb") as stream:  # numpy leaves a damaged file open
+            archive = np.load(stream, allow_pickle=False)
+            if isinstance(archive, np.ndarray):
+                raise ObservationError(f"{path} is a bare .npy array; save it with np.savez")
             content = {key: archive[key] for key in _NPZ_KEYS if key in archive.files}
             found = list(archive.files)
     except ObservationError:
         raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
         raise ObservationError(f"not a readable .npz without pickle: {error}") from error
     for key in ("depth", "intrinsics"):
         if key not in content:

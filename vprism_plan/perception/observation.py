@@ -39,7 +39,7 @@ class Observation:
     intrinsics: Any
     T_world_camera: Any = None
     color: Any = None
-    plane: Plane | None = None
+    plane: Any = None
 
     def __post_init__(self) -> None:
         depth = _validation.check_depth(self.depth)
@@ -54,9 +54,7 @@ class Observation:
         if self.color is not None:
             checked["color"] = _validation.check_color(self.color, depth.shape)
         if self.plane is not None and not isinstance(self.plane, Plane):
-            raise ObservationError(
-                f"plane is a {type(self.plane).__name__}; it must be a Plane or None"
-            )
+            raise ObservationError(f"plane is a {type(self.plane).__name__}; give a Plane or None")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 

@@ -25,6 +25,8 @@ _MAX_PLANES = 6
 _MAX_BELOW = 0.3
 # Objects on a table are rarely taller; what stands higher does not vote for a plane.
 _OBJECT_HEIGHT = 0.4
+# A flat patch larger than this is furniture or a wall, not the side of an object.
+_OBJECT_SIZE = 0.6
 _CELL = 0.04
 
 
@@ -46,8 +48,8 @@ def fit_plane(
     Seeded RANSAC on up to 20,000 points finds the large planes one after the other, each
     refined by least squares. Of these the support plane is the one that most points
     belong to *and stand on*: an empty floor behind the table or a wall has no objects
-    within 0.4 m above its visible extent. Points labelled as objects only vote as
-    things that stand on a plane.
+    within 0.4 m above its visible extent (other large planes do not count as objects).
+    Points labelled as objects only vote as things that stand on a plane.
 
     Args:
         obs: the observation; labels are used where they exist.
@@ -169,10 +171,15 @@ def _choose_support(
     The score is the number of points on the plane and standing on it, doubled by
     orientation at most: 'up' is only a hint, since a camera may be mounted upside down.
     """
+    # A floor does not stand on the wall it meets, nor a table top on the floor.
+    furniture = np.zeros(len(sample), dtype=bool)
+    for candidate in candidates:
+        if _extent(sample[candidate.inliers], candidate.plane) > _OBJECT_SIZE:
+            furniture |= candidate.inliers
     scores = []
     for candidate in candidates:
         on_plane = sample[candidate.inliers]
-        others = standing if len(standing) else sample[~candidate.inliers]
+        others = standing if len(standing) else sample[~candidate.inliers & ~furniture]
         carried = standing_on(candidate.plane, on_plane, others, threshold)
         share = carried.sum() / max(1, len(standing) if len(standing) else len(on_plane))
         # A tenth as many points standing on it as lying on it is a set table.
@@ -188,6 +195,12 @@ def _choose_support(
             scores[-1],
         )
     return candidates[int(np.argmax(scores))]
+
+
+def _extent(points: Float[np.ndarray, "n 3"], plane: Plane) -> float:
+    """Diagonal of the middle 90 % of points on a plane, metres."""
+    low, high = np.percentile(points @ plane.axes().T, [5.0, 95.0], axis=0)
+    return float(np.linalg.norm(high - low))
 
 
 def standing_on(

@@ -79,8 +79,9 @@ def segment_tabletop(
     Flying pixels (`remove_flying`), which stereo sensors invent between the two sides of a
     depth edge, and specks of at most 12 pixels and 1 cm^2 that no surface continues are set
     to depth 0, "no return": they would be obstacles in mid-air and cast shadows. This is
-    done only over the table top (10 cm around it, up to 1 m above it); elsewhere, and in
-    every piece larger than that, no pixel is ever dropped.
+    done only over the table top (10 cm around it, up to 1 m above it); elsewhere no pixel
+    is ever dropped. Ramps of more than three pixels stay, as obstacles: they may be the
+    side of a box seen at a glancing angle.
 
     Args:
         obs: observation; existing labels are replaced.

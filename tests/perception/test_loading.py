@@ -1,0 +1,344 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Every form an observation is kept in survives a round trip; every fault is one clear line."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from oracles.perception_oracles import intrinsics, look_at
+from PIL import Image
+
+from vprism_plan.errors import ObservationError
+from vprism_plan.perception import Observation, Plane, load_observation, save_observation
+from vprism_plan.perception.camera import invert_transform
+
+SHAPE = (12, 16)
+K = intrinsics(16, 12)
+CAMERA = {
+    "fx": K[0, 0],
+    "fy": K[1, 1],
+    "cx": K[0, 2],
+    "cy": K[1, 2],
+    "depth_scale": 0.001,
+}
+
+
+@pytest.fixture
+def obs() -> Observation:
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.4, 3.0, SHAPE)
+    depth[:2] = 0.0
+    return Observation(
+        depth,
+        rng.integers(0, 4, SHAPE),
+        K,
+        look_at((0.5, 0.2, 0.7)),
+        rng.integers(0, 255, (*SHAPE, 3), dtype=np.uint8),
+        Plane([0, 0.1, 1.0], 0.03),
+    )
+
+
+def raw_depth() -> np.ndarray:
+    raw = np.random.default_rng(1).integers(400, 3000, SHAPE).astype(np.uint16)
+    raw[0, :3] = 0
+    return raw
+
+
+def write(path, image) -> None:
+    Image.fromarray(image).save(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write(tmp_path / "depth.png", raw_depth())
+    (tmp_path / "camera.json").write_text(json.dumps(CAMERA))
+    return tmp_path
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A BOP scene with images 3 and 7; image 7 is posed and has objects 0 and 2."""
+    for name in ("depth", "mask_visib", "rgb"):
+        (tmp_path / name).mkdir()
+    for image in (3, 7):
+        write(tmp_path / "depth" / f"{image:06d}.png", raw_depth() + image)
+    write(tmp_path / "rgb" / "000007.png", np.full((*SHAPE, 3), 9, np.uint8))
+    first, second = np.zeros((2, *SHAPE), np.uint8)
+    first[2:5, 2:5] = second[6:9, 7:10] = 255
+    write(tmp_path / "mask_visib" / "000007_000000.png", first)
+    write(tmp_path / "mask_visib" / "000007_000002.png", second)
+    world_to_camera = invert_transform(look_at((0.5, 0.2, 0.7)))
+    cameras = {
+        "3": {"cam_K": K.ravel().tolist(), "depth_scale": 0.1},
+        "7": {
+            "cam_K": K.ravel().tolist(),
+            "depth_scale": 0.1,
+            "cam_R_w2c": world_to_camera[:3, :3].ravel().tolist(),
+            "cam_t_w2c": (1000 * world_to_camera[:3, 3]).tolist(),
+        },
+    }
+    (tmp_path / "scene_camera.json").write_text(json.dumps(cameras))
+    return tmp_path
+
+
+def assert_same(a: Observation, b: Observation, depth_tolerance: float = 0.0) -> None:
+    np.testing.assert_allclose(a.depth, b.depth, atol=depth_tolerance, rtol=0)
+    for name in ("labels", "intrinsics", "T_world_camera", "color"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    if b.plane is None:
+        assert a.plane is None
+    else:
+        np.testing.assert_allclose(a.plane.normal, b.plane.normal, atol=1e-15)
+        assert abs(a.plane.offset - b.plane.offset) < 1e-15
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_npz_round_trip_is_exact(obs, tmp_path, dtype):
+    obs = replace(obs, depth=obs.depth.astype(dtype))
+    save_observation(obs, tmp_path / "view.npz")
+    loaded = load_observation(tmp_path / "view.npz")
+    assert_same(loaded, obs)
+    assert loaded.depth.dtype == dtype
+    assert [p.name for p in tmp_path.iterdir()] == ["view.npz"]
+
+
+def test_folder_round_trip_keeps_a_tenth_of_a_millimetre(obs, tmp_path):
+    save_observation(obs, tmp_path / "view")
+    assert_same(load_observation(str(tmp_path / "view")), obs, 0.5001e-4)
+    far = replace(obs, depth=obs.depth * 10)
+    save_observation(far, tmp_path / "view")
+    assert_same(load_observation(tmp_path / "view"), far, 0.5001e-3)
+
+
+def test_saving_again_leaves_nothing_of_the_old(obs, tmp_path):
+    save_observation(obs, tmp_path / "view")
+    bare = Observation(np.round(obs.depth, 3), None, K)
+    save_observation(bare, tmp_path / "view")
+    assert_same(load_observation(tmp_path / "view"), bare, 1e-9)
+    assert sorted(p.name for p in (tmp_path / "view").iterdir()) == ["camera.json", "depth.png"]
+
+
+def test_interrupted_save_leaves_no_loadable_folder_and_no_scraps(obs, tmp_path, monkeypatch):
+    save_observation(obs, tmp_path / "view")
+
+    def fail(*args, **kwargs):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Image.Image, "save", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_observation(obs, tmp_path / "view")
+    names = sorted(p.name for p in (tmp_path / "view").iterdir())
+    assert names == ["color.png", "depth.png", "labels.png"]
+    with pytest.raises(ObservationError, match=r"camera\.json is missing"):
+        load_observation(tmp_path / "view")
+
+
+def test_interrupted_npz_keeps_the_old_file(obs, tmp_path, monkeypatch):
+    path = tmp_path / "view.npz"
+    save_observation(obs, path)
+    before = path.read_bytes()
+
+    def fail(stream, **kwargs):
+        stream.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_observation(obs, path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["view.npz"]
+
+
+def test_folder_in_metres(folder):
+    obs = load_observation(folder)
+    np.testing.assert_allclose(obs.depth, raw_depth() * 0.001)
+    np.testing.assert_allclose(obs.intrinsics, K)
+    assert obs.labels is None
+    assert not obs.posed
+
+
+def test_depth_image_with_siblings(folder):
+    write(folder / "frame0-depth.png", raw_depth())
+    write(folder / "frame0-color.png", np.full((*SHAPE, 3), 7, np.uint8))
+    write(folder / "frame0-labels.png", np.full(SHAPE, 2, np.uint8))
+    obs = load_observation(folder / "frame0-depth.png")
+    assert obs.object_ids == (2,)
+    assert (obs.color == 7).all()
+    assert load_observation(folder / "depth.png").labels is None
+
+
+def test_bop_scene_in_metres(scene):
+    first = load_observation(scene)
+    np.testing.assert_allclose(first.depth, (raw_depth() + 3) * 1e-4)
+    assert first.object_ids == ()
+    assert first.color is None
+    obs = load_observation(scene, frame=7)
+    assert obs.object_ids == (1, 3)
+    assert obs.labels[3, 3] == 1
+    assert obs.labels[7, 8] == 3
+    np.testing.assert_allclose(obs.pose, look_at((0.5, 0.2, 0.7)), atol=1e-12)
+    assert (obs.color == 9).all()
+
+
+def test_bop_scene_without_masks_is_unlabelled(scene):
+    for mask in (scene / "mask_visib").iterdir():
+        mask.unlink()
+    (scene / "mask_visib").rmdir()
+    assert load_observation(scene, frame=7).labels is None
+
+
+def edit(path, **changes) -> None:
+    content = json.loads(path.read_text())
+    content.update(changes)
+    path.write_text(json.dumps({k: v for k, v in content.items() if v != "remove"}))
+
+
+FOLDER_FAULTS = {
+    "no depth": (lambda f: (f / "depth.png").unlink(), r"no depth\.png"),
+    "no camera": (lambda f: (f / "camera.json").unlink(), r"camera\.json is missing"),
+    "broken json": (lambda f: (f / "camera.json").write_text("{"), "not readable JSON"),
+    "json list": (lambda f: (f / "camera.json").write_text("[]"), "holds a list"),
+    "no focal": (lambda f: edit(f / "camera.json", fx="remove"), "'fx' is missing"),
+    "text focal": (lambda f: edit(f / "camera.json", fy="x"), "'fy' is 'x'"),
+    "singular": (lambda f: edit(f / "camera.json", fx=0), "singular"),
+    "no scale": (lambda f: edit(f / "camera.json", depth_scale="remove"), "'depth_scale' is miss"),
+    "zero scale": (lambda f: edit(f / "camera.json", depth_scale=0), "must be positive"),
+    "millimetres": (lambda f: edit(f / "camera.json", depth_scale=1), "millimetres"),
+    "other size": (lambda f: edit(f / "camera.json", width=640), "'width' is 640"),
+    "pose shape": (lambda f: edit(f / "camera.json", T_world_camera=[1, 2]), "has 2 numbers"),
+    "pose text": (lambda f: edit(f / "camera.json", T_world_camera="x"), "not a matrix"),
+    "plane": (lambda f: edit(f / "camera.json", plane=[1]), "has 1 numbers"),
+    "8-bit depth": (
+        lambda f: write(f / "depth.png", np.ones(SHAPE, np.uint8)),
+        "pixel format L.*16-bit",
+    ),
+    "color depth": (
+        lambda f: write(f / "depth.png", np.ones((*SHAPE, 3), np.uint8)),
+        "pixel format RGB",
+    ),
+    "not an image": (lambda f: (f / "depth.png").write_bytes(b"junk"), "not a readable image"),
+    "cut short": (
+        lambda f: (f / "depth.png").write_bytes((f / "depth.png").read_bytes()[:200]),
+        "not a readable image",
+    ),
+    "labels shape": (
+        lambda f: write(f / "labels.png", np.ones((3, 3), np.uint8)),
+        r"labels have shape \(3, 3\)",
+    ),
+    "labels color": (
+        lambda f: write(f / "labels.png", np.ones((*SHAPE, 3), np.uint8)),
+        "single-channel",
+    ),
+    "color depth 16": (lambda f: write(f / "color.png", raw_depth()), "8-bit RGB"),
+}
+
+
+@pytest.mark.parametrize("name", FOLDER_FAULTS)
+def test_faulty_folder(folder, name):
+    spoil, message = FOLDER_FAULTS[name]
+    spoil(folder)
+    with pytest.raises(ObservationError, match=message) as caught:
+        load_observation(folder)
+    assert "\n" not in str(caught.value)
+    assert str(folder) in str(caught.value)
+
+
+BOP_FAULTS = {
+    "no depth": (lambda s: (s / "depth" / "000003.png").unlink(), r"000003\.png is missing"),
+    "no K": (lambda s: edit(s / "scene_camera.json", **{"3": {}}), "no 'cam_K'"),
+    "short K": (lambda s: edit(s / "scene_camera.json", **{"3": {"cam_K": [1]}}), "has 1 numbers"),
+    "empty": (lambda s: (s / "scene_camera.json").write_text("{}"), "lists no image"),
+    "half a pose": (
+        lambda s: edit(
+            s / "scene_camera.json",
+            **{"3": {"cam_K": K.ravel().tolist(), "cam_t_w2c": [0, 0, 0]}},
+        ),
+        "half a pose: 'cam_R_w2c'",
+    ),
+    "mask shape": (
+        lambda s: write(s / "mask_visib" / "000003_000000.png", np.ones((2, 2), np.uint8)),
+        r"shape \(2, 2\)",
+    ),
+    "mask name": (
+        lambda s: write(s / "mask_visib" / "000003_x.png", np.ones(SHAPE, np.uint8)),
+        "not named",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BOP_FAULTS)
+def test_faulty_bop_scene(scene, name):
+    spoil, message = BOP_FAULTS[name]
+    spoil(scene)
+    with pytest.raises(ObservationError, match=message) as caught:
+        load_observation(scene)
+    assert "\n" not in str(caught.value)
+
+
+def test_frame_must_exist_and_needs_a_scene(scene, obs, tmp_path):
+    with pytest.raises(ObservationError, match="no image 4; it has 3, 7"):
+        load_observation(scene, frame=4)
+    save_observation(obs, tmp_path / "view.npz")
+    with pytest.raises(ObservationError, match="not a BOP scene"):
+        load_observation(tmp_path / "view.npz", frame=0)
+
+
+def test_unknown_paths_are_explained(tmp_path):
+    with pytest.raises(ObservationError, match="does not exist"):
+        load_observation(tmp_path / "nothing")
+    (tmp_path / "notes.txt").write_text("x")
+    with pytest.raises(ObservationError, match="is not an observation"):
+        load_observation(tmp_path / "notes.txt")
+
+
+def test_faulty_npz(tmp_path):
+    path = tmp_path / "view.npz"
+    path.write_bytes(b"junk")
+    with pytest.raises(ObservationError, match=r"view\.npz.*not a readable"):
+        load_observation(path)
+    np.savez(path, depth=np.ones((3, 3)))
+    with pytest.raises(ObservationError, match=r"no 'intrinsics' \(found: depth\)"):
+        load_observation(path)
+    np.savez(path, depth=np.array([None]), intrinsics=K)
+    with pytest.raises(ObservationError, match="without pickle"):
+        load_observation(path)
+    np.savez(path, depth=np.full((12, 16), np.nan), intrinsics=K)
+    with pytest.raises(ObservationError, match="depth is nan"):
+        load_observation(path)
+    with path.open("wb") as stream:
+        np.save(stream, np.ones(3))
+    with pytest.raises(ObservationError, match="bare"):
+        load_observation(path)
+    path.write_bytes(b"")
+    with pytest.raises(ObservationError, match="not a readable"):
+        load_observation(path)
+
+
+def test_npz_cut_anywhere_is_refused(obs, tmp_path):
+    path = tmp_path / "view.npz"
+    save_observation(obs, path)
+    whole = path.read_bytes()
+    for length in range(0, len(whole), len(whole) // 40):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ObservationError):
+            load_observation(path)
+
+
+def test_what_cannot_be_saved_is_explained(obs, tmp_path):
+    with pytest.raises(ObservationError, match="not a folder"):
+        save_observation(obs, tmp_path / "no" / "view.npz")
+    with pytest.raises(ObservationError, match="cannot be written"):
+        save_observation(obs, tmp_path / "view.txt")
+    (tmp_path / "taken").write_text("x")
+    with pytest.raises(ObservationError, match="cannot be written"):
+        save_observation(obs, tmp_path / "taken")
+    with pytest.raises(ObservationError, match="16 bits of millimetres"):
+        save_observation(replace(obs, depth=obs.depth * 25), tmp_path / "far")
+    tiny = obs.depth.copy()
+    tiny[5, 5] = 1e-6
+    with pytest.raises(ObservationError, match="no return"):
+        save_observation(replace(obs, depth=tiny), tmp_path / "near")
+    with pytest.raises(ObservationError, match="label 70000"):
+        save_observation(replace(obs, labels=np.full(SHAPE, 70000)), tmp_path / "many")
+    assert [p.name for p in tmp_path.iterdir()] == ["taken"]
