@@ -8,11 +8,11 @@ from vprism_plan.perception import align_to_table, fit_plane, load_observation, 
 
 # Objects that a person counts, a stack as one: (fewest, most) clusters that are acceptable.
 OBJECTS = {
-    "frame0": (10, 11),
-    "frame2": (7, 9),
+    "frame0": (10, 10),
+    "frame2": (7, 8),
     "frame4": (4, 5),
-    "frame6": (7, 9),
-    "frame8": (8, 11),
+    "frame6": (7, 8),
+    "frame8": (8, 9),
 }
 # Share of the pixels with a return on the table top, and camera height over it (metres).
 TABLE = {

@@ -61,7 +61,7 @@ def segment_tabletop(
     min_height: float = 0.012,
     max_height: float = 0.5,
     max_size: float = 0.6,
-    min_area: float = 5e-4,
+    min_area: float = 1e-3,
     min_points: int = 50,
     remove_flying: bool = True,
 ) -> Observation:
