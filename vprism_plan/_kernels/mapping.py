@@ -11,7 +11,7 @@ value 0 exactly, so a result does not depend on which points share its block.
 import math
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic

@@ -4,7 +4,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Self
 
 from vprism_plan.errors import ConfigError
 
@@ -156,7 +155,7 @@ class MapConfig:
             )
 
     @classmethod
-    def paper(cls) -> Self:
+    def paper(cls) -> "MapConfig":
         """Return the paper's Table III; what it leaves open is as in the published code.
 
         Left open by the paper: prior variance (1e4 on every weight, the bias

@@ -93,7 +93,7 @@ class FeatureSpace:
         return start, items, lower, edge, shape, self.radius
 
     @property
-    def kernel_arguments(self) -> tuple[Any, ...]:
+    def kernel_arguments(self) -> tuple[Any, Any, Any, Any, Any, Any, Any]:
         """What every kernel that finds neighbours takes, after the points and blocks."""
         return (self.hinges, *self.cells)
 
@@ -142,14 +142,14 @@ class BlockFeatures:
     phi: Float[np.ndarray, "e p"]
 
     @property
-    def arguments(self) -> tuple[Any, ...]:
+    def arguments(self) -> tuple[Any, Any, Any, Any]:
         """What the learning kernels take: starts, hinge lists and features."""
         return self.block_start, self.near_start, self.near, self.phi
 
 
 def block_extent(space: FeatureSpace) -> float:
     """Return the width of a block (m) that balances shared hinges against padding."""
-    return 0.4 * space.radius
+    return 0.5 * space.radius
 
 
 def block_features(space: FeatureSpace, points: Float[np.ndarray, "n 3"]) -> BlockFeatures:

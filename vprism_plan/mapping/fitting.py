@@ -91,8 +91,8 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     # New ground is where the old lattice did not reach: nodes it already has stay its own.
     added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
     hinges = np.concatenate([old.space.hinges, added])
+    _check_hinge_count(len(hinges), config)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
-    _check_hinge_count(space, config)
     prior = expand_prior(old.space, old.posterior, space, config)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     data = TrainingData(
@@ -163,11 +163,12 @@ def new_hinges(
     """Return lattice and surface hinge points of the training data (m, world)."""
     lattice = lattice_hinges(data.lower, data.upper, plane.normal, plane.offset, config)
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
-    return np.concatenate([lattice, surface])
+    hinges = np.concatenate([lattice, surface])
+    _check_hinge_count(len(hinges), config)
+    return hinges
 
 
 def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapConfig) -> Posterior:
-    _check_hinge_count(space, config)
     features = block_features(space, data.points)
     logger.info(
         "fitting %d points, %d hinge points, %d classes",
@@ -181,10 +182,10 @@ def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapCon
     )  # fmt: skip
 
 
-def _check_hinge_count(space: FeatureSpace, config: MapConfig) -> None:
-    if len(space.hinges) > config.max_hinges:
+def _check_hinge_count(count: int, config: MapConfig) -> None:
+    if count > config.max_hinges:
         raise MapError(
-            f"the scene needs {len(space.hinges)} hinge points, more than max_hinges = "
+            f"the scene needs {count} hinge points, more than max_hinges = "
             f"{config.max_hinges}; raise it, raise hinge_spacing, or label fewer objects"
         )
 

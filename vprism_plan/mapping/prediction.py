@@ -71,24 +71,23 @@ class LogitMoments(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
+    def forward(  # noqa: D102
         ctx: Any, points: Tensor, space: FeatureSpace, mean: Any, covariance: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
         from vprism_plan._kernels import mapping as kernels
 
         x = points.detach().contiguous().numpy()
         n, classes = len(x), mean.shape[1]
-        options = {"dtype": torch.float64}
-        outputs = [torch.empty((n, classes), **options), torch.empty((n, classes), **options)]
-        outputs.append(torch.empty(n, **options))
-        slopes = [torch.empty((n, classes, 3), **options), torch.empty((n, classes, 3), **options)]
-        slopes.append(torch.empty((n, 3), **options))
-        arrays = [t.numpy() for t in (*outputs, *slopes)]
+        shapes = [(n, classes), (n, classes), (n,)]
+        outputs = [torch.empty(shape, dtype=torch.float64) for shape in shapes]
+        slopes = [torch.empty((*shape, 3), dtype=torch.float64) for shape in shapes]
+        m, v, s, m_slope, v_slope, s_slope = (t.numpy() for t in (*outputs, *slopes))
 
         def chunk(piece: slice) -> None:
             kernels.point_jacobians(
                 x, piece.start, piece.stop, *space.kernel_arguments, space.gamma,
-                space.radius**2, mean, covariance, space.row_first, space.base, *arrays,
+                space.radius**2, mean, covariance, space.row_first, space.base,
+                m, v, s, m_slope, v_slope, s_slope,
             )  # fmt: skip
 
         run_chunked(chunk, n, 256)
@@ -96,7 +95,7 @@ class LogitMoments(torch.autograd.Function):
         return outputs[0], outputs[1], outputs[2]
 
     @staticmethod
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:  # noqa: D102
         grad_mean, grad_variance, grad_support = grad_outputs
         points, mean_slope, variance_slope, support_slope = ctx.saved_tensors
         gradient = (

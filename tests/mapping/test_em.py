@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The sparse EM against the dense textbook, and what the mathematics promises."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import dense_em
+
+from vprism_plan.errors import MapError
+from vprism_plan.mapping.em import bouchard_lambda, diagonal_prior, fit_weights
+from vprism_plan.mapping.factors import dense_class
+from vprism_plan.mapping.features import block_features
+
+
+def dense_fit(problem, iterations, updates=1, radius=np.inf):
+    phi = dense_em.features(problem.points, problem.space.hinges, problem.space.gamma, radius)
+    prior = np.stack([np.diag(problem.variance)] * problem.classes)
+    mean = problem.prior_mean.T
+    return dense_em.fit(phi, problem.labels, mean, prior, iterations, updates)
+
+
+def covariances(space, posterior):
+    classes = posterior.mean.shape[1]
+    return np.stack([dense_class(space, posterior.covariance, k) for k in range(classes)])
+
+
+def relative(a, b):
+    return np.abs(a - b).max() / np.abs(b).max()
+
+
+@pytest.mark.parametrize(("classes", "updates"), [(2, 1), (3, 1), (5, 2), (7, 1), (12, 3)])
+def test_agrees_with_the_textbook_without_a_cutoff(make, classes, updates):
+    problem = make(classes, classes, cutoff=0)
+    ours = problem.fit(4, updates)
+    theirs = dense_fit(problem, 4, updates)
+    assert relative(ours.mean.T, theirs.mean) < 1e-6
+    assert relative(covariances(problem.space, ours), theirs.covariance) < 1e-6
+    np.testing.assert_allclose(ours.history, theirs.bounds, rtol=1e-9)
+
+
+def test_agrees_with_the_textbook_at_the_same_cutoff(make):
+    """Same truncated features: the posterior is the same wherever a query can look."""
+    problem = make(4, 4, n=300, hinges=60)
+    ours, theirs = problem.fit(3), dense_fit(problem, 3, radius=problem.space.radius)
+    assert problem.space.envelope_size < problem.space.size * (problem.space.size + 1) // 2
+    assert relative(ours.mean.T, theirs.mean) < 1e-6
+    sparse = covariances(problem.space, ours)
+    index = np.arange(problem.space.size)
+    stored = index[None, :] >= problem.space.row_first[:, None]
+    stored = np.where(index[None, :] <= index[:, None], stored, stored.T)
+    assert np.abs(sparse - theirs.covariance)[:, stored].max() < 1e-6 * np.abs(sparse).max()
+    # Every pair of hinges that one point can see is in the envelope, so nothing is lost.
+    square = ((problem.space.hinges[:, None] - problem.space.hinges[None]) ** 2).sum(2)
+    assert stored[:-1, :-1][square < (2 * problem.space.radius) ** 2].all()
+    assert stored[-1].all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_effect_of_the_cutoff_is_bounded(make, seed):
+    """Dropping features below 1e-5 moves no probability by more than 2e-3."""
+    whole, cut = make(seed, 4, n=300, hinges=60, cutoff=0), make(seed, 4, n=300, hinges=60)
+    query = np.random.default_rng(seed).uniform(-0.25, 0.25, (200, 3))
+    answers = []
+    for problem in (whole, cut):
+        phi = dense_em.features(
+            query, problem.space.hinges, problem.space.gamma, problem.space.radius
+        )
+        posterior = problem.fit(4)
+        sigma = covariances(problem.space, posterior)
+        answers.append(dense_em.predict(phi, posterior.mean.T, sigma))
+    assert np.abs(answers[0] - answers[1]).max() < 2e-3
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 10**6),
+    classes=st.integers(2, 12),
+    updates=st.integers(1, 3),
+    scale=st.sampled_from([0.05, 1.0, 300.0]),
+)
+def test_evidence_bound_never_falls(make, seed, classes, updates, scale):
+    problem = make(seed, classes, n=60, hinges=15)
+    problem.variance = problem.variance * scale
+    history = np.array(problem.fit(6, updates).history)
+    assert len(history) >= 2
+    assert (np.diff(history) >= -1e-9 * np.abs(history[1:])).all()
+
+
+@settings(max_examples=60)
+@given(
+    z=st.lists(st.floats(-30, 30), min_size=2, max_size=12),
+    alpha=st.floats(-30, 30),
+    seed=st.integers(0, 10**6),
+)
+def test_bouchard_inequality(z, alpha, seed):
+    z = np.array(z)
+    xi = np.abs(np.random.default_rng(seed).normal(scale=5.0, size=len(z)))
+    left = np.logaddexp.reduce(z)
+    assert left <= dense_em.bouchard_right_side(z, alpha, xi) + 1e-9
+
+
+def test_lambda_and_its_limit():
+    xi = np.array([0.0, 1e-12, 1e-6, 0.999e-3, 1.001e-3, 0.5, 3.0, 40.0, 1e4])
+    expected = [dense_em.lam(x) if x > 1e-4 else 0.125 for x in xi]
+    np.testing.assert_allclose(bouchard_lambda(xi), expected, rtol=1e-7)
+    assert bouchard_lambda(np.zeros(1))[0] == 0.125
+
+
+def test_more_variational_updates_raise_the_bound(make):
+    problem = make(11, 5)
+    assert problem.fit(3, 4).history[-1] >= problem.fit(3, 1).history[-1]
+
+
+def test_order_of_points_does_not_matter(make):
+    problem = make(2, 4)
+    first = problem.fit()
+    order = np.random.default_rng(0).permutation(len(problem.points))
+    problem.points, problem.labels = problem.points[order], problem.labels[order]
+    second = problem.fit()
+    np.testing.assert_allclose(second.mean, first.mean, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-8, atol=1e-8)
+
+
+def test_order_of_classes_does_not_matter(make):
+    problem = make(3, 5)
+    first = problem.fit()
+    swap = np.array([3, 0, 4, 1, 2])  # old class -> new class
+    problem.labels = swap[problem.labels]
+    problem.prior_mean = problem.prior_mean[:, np.argsort(swap)]
+    second = problem.fit()
+    np.testing.assert_allclose(second.mean[:, swap], first.mean, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(second.covariance[:, swap], first.covariance, rtol=1e-8, atol=1e-8)
+
+
+def test_number_of_threads_does_not_change_a_bit(make, monkeypatch):
+    problem = make(5, 6, n=400, hinges=60)
+    results = []
+    for threads in ("1", "3"):
+        monkeypatch.setenv("VPRISM_PLAN_THREADS", threads)
+        results.append(problem.fit())
+    np.testing.assert_array_equal(results[0].mean, results[1].mean)
+    np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
+
+
+def test_huge_logits_stay_finite(make):
+    problem = make(6, 3)
+    problem.variance = np.full(problem.space.size, 1e8)
+    posterior = problem.fit(20)
+    assert np.isfinite(posterior.mean).all()
+    assert np.isfinite(posterior.history).all()
+
+
+def test_a_tolerance_stops_early(make):
+    problem = make(7, 3)
+    prior = diagonal_prior(problem.space, problem.prior_mean, problem.variance)
+    features = block_features(problem.space, problem.points)
+    posterior = fit_weights(
+        problem.space, features, problem.labels, prior, iterations=200, tolerance=1e-3
+    )
+    assert 2 <= len(posterior.history) < 100
+
+
+def test_a_label_that_is_no_class_is_refused(make):
+    problem = make(8, 3)
+    problem.labels = problem.labels.copy()
+    problem.labels[7] = 3
+    with pytest.raises(MapError, match=r"0\.\.2"):
+        problem.fit()
