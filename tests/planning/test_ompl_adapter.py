@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The two classes inside somebody else's OMPL program."""
 
+import threading
 from itertools import pairwise
 
 import disk_world
@@ -17,6 +18,7 @@ from vprism_plan.planning import (
     RobotLike,
     VPrismMotionValidator,
     VPrismStateValidityChecker,
+    _spaces,
     last_valid,
     quiet_ompl,
     state_space,
@@ -183,6 +185,33 @@ def test_exceptions_of_the_checker_come_out_unchanged(method):
     state = to_state(si.getStateSpace(), np.array([0.9, 0.9]))
     with pytest.raises(BoomError, match="unplugged"):
         si.checkMotion(state, state)
+
+
+def test_a_second_thread_gets_its_own_answer():
+    checker = one_disk()
+    si = attach(checker)
+    svc = VPrismStateValidityChecker(si, checker)
+    space = si.getStateSpace()
+    answers = []
+    thread = threading.Thread(
+        target=lambda: answers.append(svc.isValid(to_state(space, np.zeros(2))))
+    )
+    thread.start()
+    thread.join()
+    assert answers == [False]
+    assert svc.isValid(to_state(space, np.array([0.9, 0.9])))
+    assert svc.checks == 2
+
+
+def test_without_the_capsule_route_the_answers_are_the_same(monkeypatch):
+    monkeypatch.setattr(_spaces, "_CAPSULE_NAME", b"renamed_by_nanobind")
+    checker = one_disk()
+    si = attach(checker)
+    space = si.getStateSpace()
+    left, right = to_state(space, np.array([-0.9, 0.0])), to_state(space, np.array([0.9, 0.0]))
+    assert si.isValid(left)
+    assert not si.isValid(to_state(space, np.zeros(2)))
+    assert not si.checkMotion(left, right)
 
 
 def test_last_valid_stops_at_the_disk():

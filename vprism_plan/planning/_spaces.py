@@ -198,6 +198,11 @@ class StateReader:
         self.fast = _serialisation_works(space, dof)
         self.buffers = _Buffers(dof, self.fast)
 
+    def private_buffer(self) -> tuple[Any, Float[np.ndarray, " dof"]]:
+        """Return a capsule to serialise to and the array behind it, shared with nobody."""
+        buffer = np.zeros(len(self.wraps))
+        return _new_capsule(buffer.ctypes.data, _CAPSULE_NAME, None), buffer
+
     def read(self, state: Any) -> Float[np.ndarray, " dof"]:
         """Return this thread's first buffer, holding `state`; valid until the next read."""
         buffers = self.buffers

@@ -9,7 +9,9 @@ that holds `si` closes a reference cycle that neither side can collect.
 """
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -25,11 +27,7 @@ _UNAMBIGUOUS_TURN = 0.9 * math.pi
 
 
 class VPrismStateValidityChecker(ob.StateValidityChecker):
-    """OMPL's question "is this state valid?", answered by a checker.
-
-    Attributes:
-        checks: number of states asked about so far.
-    """
+    """OMPL's question "is this state valid?", answered by a checker."""
 
     def __init__(self, si: Any, checker: CheckerLike) -> None:
         """Attach `checker` to the space of `si` (one dimension per joint, flat order).
@@ -38,31 +36,61 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
         RealVector and SO2 parts.
         """
         super().__init__(si)
-        self.checks = 0
         self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
         self._clearance = checker.clearance
-        self._is_valid = checker.is_valid_buffer
-        # Looked up once: this runs for every state a planner samples.
-        self._fast = self._reader.fast
-        self._buffers = self._reader.buffers
-        self._serialize: Any = self._reader.space.serialize if self._fast else None
+        self._ask, self._asked = _question(self._reader, checker.is_valid_buffer)
+
+    @property
+    def checks(self) -> int:
+        """Number of states asked about so far."""
+        return self._asked()
 
     def isValid(self, state: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
         """Return whether `state` is valid; exceptions of the checker propagate.
 
         OMPL dispatches its longer overloads to this name too, hence `*unused`.
         """
-        self.checks += 1
-        if self._fast:
-            buffers = self._buffers
-            self._serialize(buffers.capsule_a, state)
-            return bool(self._is_valid(buffers.a))
-        # The bindings accept nothing but a genuine bool.
-        return bool(self._is_valid(self._reader.read(state)))
+        return self._ask(state)
 
     def clearance(self, state: Any, *unused: Any) -> float:
         """Return metres to the nearest obstacle, negative inside one."""
         return float(self._clearance(self._reader.read(state).copy()))
+
+
+def _question(
+    reader: StateReader, is_valid: Callable[[Any], bool]
+) -> tuple[Callable[[Any], bool], Callable[[], int]]:
+    """Return a function that asks about a state, and one that says how often it was asked.
+
+    This runs for every state a planner samples. Names of a closure are found in half
+    the time of attributes, and comparing thread numbers costs less than thread-local
+    storage: the thread that made the checker has buffers of its own.
+    """
+    asked = 0
+    owner = get_ident()
+
+    def count() -> int:
+        return asked
+
+    def ask_any(state: Any) -> bool:
+        nonlocal asked
+        asked += 1
+        # The bindings accept nothing but a genuine bool.
+        return bool(is_valid(reader.read(state)))
+
+    if not reader.fast:
+        return ask_any, count
+    serialize, target, buffer = reader.space.serialize, *reader.private_buffer()
+
+    def ask(state: Any) -> bool:
+        nonlocal asked
+        if get_ident() != owner:
+            return ask_any(state)
+        asked += 1
+        serialize(target, state)
+        return bool(is_valid(buffer))
+
+    return ask, count
 
 
 class VPrismMotionValidator(ob.MotionValidator):
