@@ -4,6 +4,7 @@
 python examples/own_ompl_program.py
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -46,9 +47,8 @@ def main() -> np.ndarray:
     setup.setPlanner(og.RRTConnect(si))
     setup.solve(5.0)
     if not setup.haveExactSolutionPath():  # an approximate solution is none
-        raise SystemExit(f"no path: start {checker.explain(START).text()}; goal "
-                         f"{checker.explain(GOAL).text()}")  # fmt: skip
-    setup.simplifySolution()
+        sys.exit(f"no path. Start: {checker.explain(START).text()}. "
+                 f"Goal: {checker.explain(GOAL).text()}")  # fmt: skip
     return np.array([to_array(space, state) for state in setup.getSolutionPath().getStates()])
 
 

@@ -39,6 +39,14 @@ class PoseGoalConfig:
     rotation_tolerance: float = 1e-3
     max_goals: int = 8
 
+    def __post_init__(self) -> None:
+        for name in ("attempts", "iterations", "max_goals"):
+            if getattr(self, name) < 1:
+                raise PlanningError(f"{name} is {getattr(self, name)!r}; it must be at least 1")
+        for name in ("position_tolerance", "rotation_tolerance"):
+            if not getattr(self, name) > 0.0:
+                raise PlanningError(f"{name} is {getattr(self, name)!r}; it must be more than 0")
+
 
 @dataclass(frozen=True)
 class PoseSolutions:
