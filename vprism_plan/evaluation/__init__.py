@@ -2,6 +2,7 @@
 """How good is it, against what: scenes with ground truth."""
 
 from vprism_plan.evaluation.camera import Camera, DepthNoise
+from vprism_plan.evaluation.scene_io import load_ground_truth, save_scene
 from vprism_plan.evaluation.scenes import (
     Scene,
     demo_scene,
@@ -22,7 +23,9 @@ __all__ = [
     "cylinder",
     "demo_scene",
     "hidden_object_scene",
+    "load_ground_truth",
     "random_scene",
     "render",
+    "save_scene",
     "sphere",
 ]

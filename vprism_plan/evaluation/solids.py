@@ -196,9 +196,9 @@ class Frustum(Solid):
 
     def _profile(self) -> np.ndarray:
         h = self.half_height
-        return np.array(
-            [[0.0, -h], [self.bottom_radius, -h], [self.top_radius, h], [0.0, h]], dtype=np.float64
-        )
+        outline = [[0.0, -h], [self.bottom_radius, -h], [self.top_radius, h], [0.0, h]]
+        # A cone's tip, or its flipped bottom, would otherwise occur twice.
+        return np.array([q for k, q in enumerate(outline) if k == 0 or q != outline[k - 1]])
 
     def _distance(self, p: np.ndarray) -> np.ndarray:
         # In the half plane (radius, z): distance to the nearer cap, and to the slanted side.
@@ -264,6 +264,15 @@ class Capsule(Solid):
         lower[:, 1] -= self.half_length
         upper[:, 1] += self.half_length
         return np.concatenate([lower, upper if self.half_length > 0 else upper[1:]])
+
+    def surface_points(self, spacing: float) -> Float[np.ndarray, "m 3"]:
+        """Return world points exactly on the surface, about `spacing` metres apart."""
+        chord = (super().surface_points(spacing) - self.center) @ self.pose[:3, :3]
+        axis = np.zeros_like(chord)
+        axis[:, 2] = np.clip(chord[:, 2], -self.half_length, self.half_length)
+        offset = chord - axis
+        offset *= self.radius / np.linalg.norm(offset, axis=1, keepdims=True)
+        return self._to_world(axis + offset)
 
     def _distance(self, p: np.ndarray) -> np.ndarray:
         q = p.copy()

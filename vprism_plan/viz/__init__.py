@@ -1,0 +1,18 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a person sees: pictures of the input, the map and the plan."""
+
+from vprism_plan.viz._figures import object_color, save_figure
+from vprism_plan.viz.map_plot import map_figure
+from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample, sphere_centers
+from vprism_plan.viz.scene_plot import scene_figure
+
+__all__ = [
+    "hand_path",
+    "map_figure",
+    "object_color",
+    "plan_figure",
+    "resample",
+    "save_figure",
+    "scene_figure",
+    "sphere_centers",
+]
