@@ -128,6 +128,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--map", type=Path, help="a saved map of the demo scene, to skip the fit")
     checker = demo_checker(parser.parse_args().map)
+    for q in (START, GOAL):
+        if not checker.is_valid(q):
+            raise SystemExit(f"{q.tolist()} is invalid: {checker.explain(q).text()}")
     callbacks(checker)
     queries(checker)
 
