@@ -119,7 +119,7 @@ class MapConfig:
     iterations: int = 6
     variational_updates: int = 3
     tolerance: float = 1e-5
-    prior_logit_variance: float | None = 50.0
+    prior_logit_variance: float | None = 10.0
     prior_weight_variance: float | None = None
     bias_variance: float = 1e-8
     prior_occupancy: float | None = 0.3
