@@ -68,6 +68,12 @@ def small_map(scene: Scene) -> VPrismMap:
 
 
 @pytest.fixture(scope="session")
+def default_map(scene: Scene) -> VPrismMap:
+    """The same scene with the default preset, for what is said about its accuracy."""
+    return fit_map(scene.observation)
+
+
+@pytest.fixture(scope="session")
 def coarse() -> MapConfig:
     return COARSE
 
