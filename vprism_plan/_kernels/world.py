@@ -13,9 +13,11 @@ from numba import njit
 # Larger than any squared distance in lattice units that a grid can hold.
 FAR = np.int32(2**30)
 
-FREE, OCCLUDED, UNOBSERVED = np.uint8(0), np.uint8(1), np.uint8(2)
-# Only used for blocks of cells: outside the image (nothing to refine), or undecided.
-_OUTSIDE, _MIXED = np.uint8(3), np.uint8(4)
+# What views say of a cell; of several views the smallest code holds. PARTLY: some of it
+# may be occluded and the rest unobserved.
+FREE, OCCLUDED, PARTLY, UNOBSERVED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3)
+# Outside the image, where there is nothing to refine; reaching behind the camera.
+_OUTSIDE, _BEHIND = np.uint8(4), np.uint8(5)
 
 
 # --- Exact distance from a coarse lattice to marked nodes of a finer one ------------
@@ -221,7 +223,7 @@ def _classify(px, py, pz, half, camera, optics, reach, holes):
     if far <= 0.0:
         return _OUTSIDE
     if near <= 1e-6:
-        return _MIXED
+        return _BEHIND
     rows, columns = reach.shape[1], reach.shape[2]
     low, high = _span(x, hx, near, far)
     u0 = math.floor(optics[0] * low + optics[2])
@@ -234,16 +236,15 @@ def _classify(px, py, pz, half, camera, optics, reach, holes):
     complete = u0 >= 0 and v0 >= 0 and u1 < columns and v1 < rows
     u0, v0 = max(u0, 0), max(v0, 0)
     u1, v1 = min(u1, columns - 1), min(v1, rows - 1)
+    complete = complete and _window_min(holes, u0, u1, v0, v1) > 0
     if far > _window_min(reach, u0, u1, v0, v1):
-        return OCCLUDED
-    if complete and _window_min(holes, u0, u1, v0, v1) > 0:
-        return FREE
-    return UNOBSERVED
+        return OCCLUDED if complete else PARTLY
+    return FREE if complete else UNOBSERVED
 
 
 @njit(cache=True, nogil=True)
 def classify_cells(origin, spacing, camera, optics, reach, holes, status, start, stop):
-    """Lower status (free < occluded < unobserved) to what this view says of each cell.
+    """Lower status to what this view says of each cell.
 
     Slices run over blocks of 8 cells along x: a block that is wholly free or wholly
     outside the image needs no look at its cells.

@@ -39,8 +39,9 @@ class Cells:
     Attributes:
         index: (n, 3) lowest corner, in units of the finest lattice spacing.
         size: edge length in the same units.
-        label: (n,) most probable object (class 1..C) at a corner of the cell.
-        around: (n, 8) the same at the corners of the evaluated cell that contains it.
+        label: (n,) most probable object (class 1..C) at the most occupied corner of the
+            evaluated cell that contains it.
+        around: (n, 8) the same at each corner of that cell, 0 where it is not occupied.
     """
 
     index: Int[np.ndarray, "n 3"]
@@ -87,7 +88,7 @@ def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]
 
 def _evaluate(
     map_: Any, points: Float[np.ndarray, "n 3"], level: float
-) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+) -> tuple[Float[np.ndarray, " n"], UInt8[np.ndarray, " n"]]:
     """Log-odds less those of the level, and the most probable object class, at points."""
     values = np.empty(len(points))
     labels = np.empty(len(points), dtype=np.uint8)
@@ -199,12 +200,29 @@ def _divide(
     for child in _CHILDREN:
         block = (slice(None), *(slice(c, c + 2) for c in child))
         corners = g[block].reshape(len(g), 8)
-        around = owners[block].reshape(len(g), 8)
-        cells = Cells(index + child * size, size, around[:, 0], around)
+        label, around = _ownership(corners, owners[block].reshape(len(g), 8), slack)
+        cells = Cells(index + child * size, size, label, around)
         whole = (corners.min(axis=1) >= slack) & (around == around[:, :1]).all(axis=1)
         inside.append(cells.select(whole))
         border.append(cells.select((corners.max(axis=1) >= -slack) & ~whole))
     return _join(inside), _join(border)
+
+
+def _ownership(
+    corners: Float[np.ndarray, "n 8"],
+    owners: UInt8[np.ndarray, "n 8"],
+    slack: Float[np.ndarray, " n"],
+) -> tuple[UInt8[np.ndarray, " n"], UInt8[np.ndarray, "n 8"]]:
+    """Owner at the most occupied corner, and at all corners that may be occupied.
+
+    Off the objects the likeliest of them says little: counted there, the skin of one
+    object would belong to another.
+    """
+    best = corners.argmax(axis=1)
+    rows = np.arange(len(corners))
+    around = np.where(corners >= -slack[:, None], owners, np.uint8(0))
+    around[rows, best] = owners[rows, best]
+    return owners[rows, best], around
 
 
 def _border(
@@ -225,10 +243,10 @@ def _border(
     for child in np.ndindex(4, 4, 4):
         corners = fine[(slice(None), *(slice(c, c + 2) for c in child))].reshape(len(g), 8)
         chosen = corners.max(axis=1) >= -slack
-        block = tuple(slice(c // 2, c // 2 + 2) for c in child)
-        around = owners[(chosen, *block)].reshape(-1, 8)
-        own = owners[(chosen, *((c + 1) // 2 for c in child))]
-        kept.append(Cells(index[chosen] + np.array(child), 1, own, around))
+        block = (chosen, *(slice(c // 2, c // 2 + 2) for c in child))
+        evaluated, owner = g[block].reshape(-1, 8), owners[block].reshape(-1, 8)
+        label, around = _ownership(evaluated, owner, slack[chosen])
+        kept.append(Cells(index[chosen] + np.array(child), 1, label, around))
     return _join(kept)
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.errors import ConfigError
+from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.world.config import check_level
 
 if TYPE_CHECKING:
@@ -18,6 +18,8 @@ _log = logging.getLogger(__name__)
 
 _CHUNK = 1 << 16
 _MAX_NODES = 60_000_000
+# Probability: moves a surface by less than its own discretisation error.
+_PUSHES = (1e-3, 3e-3, 1e-2)
 
 
 def extract_meshes(
@@ -36,6 +38,7 @@ def extract_meshes(
 
     Raises:
         ConfigError: level or resolution is out of range.
+        WorldError: a surface could not be closed.
     """
     probabilities, origin = _sample(map, level, resolution)
     occupied = probabilities[..., 1:].sum(axis=-1) - level
@@ -103,19 +106,26 @@ def _sample(
 def _surface(
     inside: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, " 3"], resolution: float
 ) -> "trimesh.Trimesh | None":
-    """Surface {inside = 0} around {inside > 0}; None if there is none."""
+    """Surface {inside = 0} around {inside > 0}; None if there is none.
+
+    A vertex that nearly coincides with a node leaves triangles without area and, when
+    those are merged, holes: values this close to 0 are pushed away from it first.
+    """
     import trimesh
     from skimage.measure import marching_cubes
 
     if not (inside > 0).any():
         return None
-    # A value of exactly 0 at a node makes triangles without area.
-    values = np.where(inside == 0, -1e-7, inside).astype(np.float32)
-    vertices, faces, _, _ = marching_cubes(
-        values,
-        0.0,
-        spacing=(resolution,) * 3,
-        gradient_direction="ascent",
-        allow_degenerate=False,
+    for push in _PUSHES:
+        values = np.where(inside > 0, np.maximum(inside, push), np.minimum(inside, -push))
+        vertices, faces, _, _ = marching_cubes(
+            values.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
+        )
+        mesh = trimesh.Trimesh(
+            origin + resolution * vertices.astype(np.float64), faces, process=True
+        )
+        if mesh.is_watertight and mesh.volume > 0:
+            return mesh
+    raise WorldError(
+        f"marching cubes at {resolution} m gave no closed surface; use another resolution or level"
     )
-    return trimesh.Trimesh(vertices + origin, faces, process=True)

@@ -16,7 +16,10 @@ from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.perception import Observation, Plane
 
+# Codes of points.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
+# Of a point, a kernel's "partly" means that some pixel around it has the point in shadow.
+_OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 
 
@@ -88,13 +91,13 @@ def classify_cells(
     spacing: float,
     shape: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "nx ny nz"]:
-    """Status of every cell of a lattice: SEEN, OCCLUDED or UNOBSERVED.
+    """Status of every cell of a lattice: FREE, OCCLUDED, PARTLY or UNOBSERVED (`kernels`).
 
     Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that
     sees a cell outweighs any number that do not. Cells wholly under the support plane
-    are called SEEN: the half-space answers for them.
+    are called FREE: the half-space answers for them.
     """
-    status = np.full(shape, UNOBSERVED, dtype=np.uint8)
+    status = np.full(shape, kernels.UNOBSERVED, dtype=np.uint8)
     blocks = -(-shape[0] // _BLOCK)
     for view in views:
 
@@ -128,12 +131,12 @@ def classify_points(
 ) -> UInt8[np.ndarray, " n"]:
     """Status of every point: SEEN, OCCLUDED or UNOBSERVED."""
     points = np.ascontiguousarray(points, dtype=np.float64)
-    status = np.full(len(points), UNOBSERVED, dtype=np.uint8)
+    status = np.full(len(points), kernels.UNOBSERVED, dtype=np.uint8)
     for view in views:
         kernels.classify_points(
             points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
         )
-    return status
+    return _OF_POINT[status]
 
 
 def background_points(

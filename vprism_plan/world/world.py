@@ -132,9 +132,12 @@ class World:
             status = visibility.classify_cells(
                 self._views, self.map.plane, grid.origin, spacing, shape
             )
+            shadow = 0 if config.occluded == "free" else _OCCLUDED
+            unseen = 0 if config.unobserved == "free" else _UNOBSERVED
             marks = np.zeros(4, dtype=np.uint8)
-            marks[visibility.OCCLUDED] = 0 if config.occluded == "free" else _OCCLUDED
-            marks[visibility.UNOBSERVED] = 0 if config.unobserved == "free" else _UNOBSERVED
+            marks[kernels.OCCLUDED] = shadow
+            marks[kernels.PARTLY] = shadow or unseen
+            marks[kernels.UNOBSERVED] = unseen
             if config.occluded == "posterior":
                 self._trust_posterior(status, spacing)
             _mark_corners(marks[status], nodes)
@@ -145,20 +148,22 @@ class World:
         return Lattice(nodes, grid.first * _CELLS, _CELLS)
 
     def _trust_posterior(self, status: UInt8[np.ndarray, "nx ny nz"], spacing: float) -> None:
-        """Call occluded cells seen where the map has support: its level set decides there."""
+        """Call occluded cells free where the map has support: its level set decides there."""
         origin = self.grid.origin
         lower, upper = (np.asarray(c) for c in self.map.support_bounds())
         first = np.clip(np.floor((lower - origin) / spacing).astype(int), 0, status.shape)
         last = np.clip(np.ceil((upper - origin) / spacing).astype(int), 0, status.shape)
         for x in range(int(first[0]), int(last[0])):
             part = status[x, first[1] : last[1], first[2] : last[2]]
-            hidden = np.argwhere(part == visibility.OCCLUDED)
+            hidden = np.argwhere((part == kernels.OCCLUDED) | (part == kernels.PARTLY))
             if len(hidden) == 0:
                 continue
             index = np.column_stack([np.full(len(hidden), x), hidden + first[1:]])
             centers = origin + spacing * (index + 0.5)
             known = np.asarray(self.map.support(centers)) >= self.config.min_support
-            part[tuple(hidden[known].T)] = visibility.SEEN
+            where = tuple(hidden[known].T)
+            whole = part[where] == kernels.OCCLUDED
+            part[where] = np.where(whole, kernels.FREE, kernels.UNOBSERVED)
 
     def _unseen_distances(self, lattice: Lattice) -> NodeDistances:
         names = np.full(256, -1, dtype=np.int16)
@@ -209,6 +214,8 @@ class World:
 
     def object_field(self, object_id: int) -> DistanceField:
         """Distance to one object alone: where P(occupied) >= level and it is the likeliest.
+
+        Which object a point belongs to is resolved to half the grid's resolution.
 
         Raises:
             WorldError: the map has no such object.
@@ -318,6 +325,6 @@ def _mark_corners(cells: UInt8[np.ndarray, "x y z"], nodes: UInt8[np.ndarray, "x
 
 def _distance_to_faces(grid: Grid) -> np.ndarray:
     """Distance from every node to the nearest face of the grid's box, metres."""
-    to_face = [np.minimum(np.arange(n), np.arange(n)[::-1]) for n in grid.shape]
-    steps = np.minimum.reduce(np.ix_(*to_face))
+    x, y, z = (np.minimum(np.arange(n), np.arange(n)[::-1]) for n in grid.shape)
+    steps = np.minimum(np.minimum(x[:, None, None], y[None, :, None]), z)
     return round_down(grid.spacing * steps.astype(np.float64))
