@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command line: `vprism-plan demo | map | plan | query | mesh`.
+
+Exit codes: 0 done, 1 no safe answer, 2 bad input, 130 interrupted; 3 is a defect of
+this program, with a traceback to report.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from vprism_plan.errors import VPrismError
+
+if TYPE_CHECKING:
+    from vprism_plan.cli._commands import Command
+
+DONE, NO_SAFE_ANSWER, BAD_INPUT, DEFECT, INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return its exit code. Errors are one line on stderr."""
+    from vprism_plan.cli._parsing import UsageError, parse
+
+    try:
+        command = parse(sys.argv[1:] if arguments is None else arguments)
+    except UsageError as error:
+        return _complain(error)
+    except SystemExit:  # --help
+        return DONE
+    # Two OpenMP runtimes that spin on the same cores cost more than they bring; the
+    # kernels have their own thread pool.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        return _run(command)
+    except Exception:
+        import traceback
+
+        traceback.print_exc()
+        return DEFECT
+
+
+def _run(command: "Command") -> int:
+    """Run a command; what its input or its user can cause becomes an exit code."""
+    from vprism_plan.cli._dispatch import run
+
+    try:
+        return run(command)
+    except BrokenPipeError:  # the reader of our output left early
+        sys.stderr.close()
+        return DONE
+    except (VPrismError, OSError) as error:
+        return _complain(error)
+    except KeyboardInterrupt:
+        sys.stderr.write("vprism-plan: interrupted; nothing was left half-written\n")
+        return INTERRUPTED
+
+
+def _complain(error: Exception) -> int:
+    sys.stderr.write(f"vprism-plan: error: {' '.join(str(error).split())}\n")
+    return BAD_INPUT

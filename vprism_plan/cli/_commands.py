@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What can be asked for on the command line: one dataclass per command, help with units.
+
+Nothing heavy is imported here, so `--help` answers at once.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import AvoidSubcommands, Positional, arg, subcommand
+
+Planner = Literal["RRTConnect", "RRTstar", "InformedRRTstar", "BITstar", "KPIECE1", "AORRTC"]
+Triple = tuple[float, float, float]
+Pose7 = tuple[float, float, float, float, float, float, float]
+
+_XYZ = arg(metavar="X Y Z")
+_JOINTS = arg(metavar="Q1 Q2 ...")
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Fit a map of the bundled scene, plan a Panda arm across it, write pictures and results."""
+
+    output: Path = Path("out/demo")
+    """Folder for scene.png, map.png, plan.png, map.safetensors, meshes/, trajectory.json
+    and report.json."""
+    seed: int = 0
+    """Seed of the fit and of the planner."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True)
+class Map:
+    """Fit a map to one view and save it.
+
+    INPUT is an .npz, a folder (depth.png, camera.json, optional labels.png), a BOP scene or
+    X-depth.png beside camera.json. Without labels it is segmented; without a camera pose the
+    world is laid on the table (z up, table at z = 0).
+    """
+
+    input: Positional[Path]
+    """The view."""
+    output: Path = Path("map.safetensors")
+    """File to write."""
+    frame: Annotated[int | None, arg(metavar="INT")] = None
+    """Image of a BOP scene; default the first."""
+    preset: Literal["default", "paper"] = "default"
+    """Settings of the fit: calibrated for planning, or the paper's Table III."""
+    seed: int = 0
+    """Seed of the sampling."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Plan a motion around what a view shows, and verify it.
+
+    INPUT is a view (as for `map`) or a .safetensors map. What is not given is chosen and
+    reported: the base beside the objects, start and goal with the hand on either side of them.
+    """
+
+    input: Positional[Path]
+    """The view or the map."""
+    robot: Annotated[Path, arg(metavar="URDF")]
+    """Robot description; an SRDF of the same name beside it is used."""
+    output: Path = Path("out/plan")
+    """Folder for scene.png, map.png, plan.png, map.safetensors, meshes/, trajectory.json
+    and report.json."""
+    base_xyz: Annotated[Triple | None, _XYZ] = None
+    """Position of the robot's root link in the world (m)."""
+    base_yaw: Annotated[float | None, arg(metavar="RAD")] = None
+    """Turn of the root link about world z (rad); default: facing the objects."""
+    start: Annotated[tuple[float, ...] | None, _JOINTS] = None
+    """Start configuration (rad, m for sliding joints), in the URDF's joint order."""
+    goal: Annotated[tuple[float, ...] | None, _JOINTS] = None
+    """Goal configuration (rad, m for sliding joints)."""
+    goal_pose: Annotated[Pose7 | None, arg(metavar="X Y Z QW QX QY QZ")] = None
+    """Instead of a goal: pose of the end effector in the world (m, unit quaternion wxyz)."""
+    planner: Planner = "RRTConnect"
+    """OMPL planner."""
+    time_limit: float = 5.0
+    """Wall time for the search (s)."""
+    margin: float = 0.0
+    """Clearance to keep from everything (m)."""
+    occluded: Literal["occupied", "posterior", "free"] = "occupied"
+    """What space behind visible surfaces counts as."""
+    unobserved: Literal["free", "occupied"] = "free"
+    """What space outside the image counts as."""
+    frame: Annotated[int | None, arg(metavar="INT")] = None
+    """Image of a BOP scene; default the first."""
+    seed: int = 0
+    """Seed of the fit, of what is chosen, and of the planner."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True)
+class Query:
+    """Ask whether one configuration is free, with what clearance, and why not.
+
+    Exit code 0: free; 1: refused.
+    """
+
+    map: Positional[Path]
+    """A .safetensors map."""
+    robot: Annotated[Path, arg(metavar="URDF")]
+    """Robot description."""
+    q: Annotated[tuple[float, ...], _JOINTS]
+    """Configuration (rad, m for sliding joints), in the URDF's joint order."""
+    base_xyz: Annotated[Triple | None, _XYZ] = None
+    """Position of the robot's root link in the world (m); default: the place that `plan`
+    chooses beside the objects."""
+    base_yaw: Annotated[float | None, arg(metavar="RAD")] = None
+    """Turn of the root link about world z (rad); default: facing the objects."""
+    margin: float = 0.0
+    """Clearance that is required (m)."""
+    occluded: Literal["occupied", "posterior", "free"] = "occupied"
+    """What space behind visible surfaces counts as."""
+    unobserved: Literal["free", "occupied"] = "free"
+    """What space outside the image counts as."""
+    seed: int = 0
+    """Seed of the choice of a base, as for `plan`."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Write the surface of every object of a map as PLY (m, world frame)."""
+
+    map: Positional[Path]
+    """A .safetensors map."""
+    output: Path
+    """Folder for object_ID.ply."""
+    level: float = 0.5
+    """Probability of being occupied at the surface."""
+    resolution: float = 0.01
+    """Edge of the grid (m)."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+Command = Demo | Map | Plan | Query | Mesh
+CommandLine = AvoidSubcommands[
+    Annotated[Demo, subcommand("demo")]
+    | Annotated[Map, subcommand("map")]
+    | Annotated[Plan, subcommand("plan")]
+    | Annotated[Query, subcommand("query")]
+    | Annotated[Mesh, subcommand("mesh")]
+]

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Commands about the map itself: `map` and `mesh`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vprism_plan._files import replacing
+from vprism_plan.cli._commands import Map, Mesh
+from vprism_plan.cli._console import Console
+from vprism_plan.cli._staging import MESH_FILES, staged
+from vprism_plan.errors import ObservationError
+
+if TYPE_CHECKING:
+    from vprism_plan.mapping import VPrismMap
+    from vprism_plan.perception import Observation
+
+
+def observe(path: Path, frame: int | None, seed: int, console: Console) -> "Observation":
+    """Load a view; segment it if it has no labels, align it if it has no pose.
+
+    Raises:
+        ObservationError: the view cannot be used, or shows no object.
+    """
+    from vprism_plan.perception import align_to_table, load_observation, segment_tabletop
+
+    with console.stage("load"):
+        obs = load_observation(path, frame=frame)
+    if obs.labels is None:
+        with console.stage("segment"):
+            obs = segment_tabletop(obs, seed=seed)
+    obs.require_objects()
+    if not obs.posed:
+        with console.stage("align"):
+            obs = align_to_table(obs, seed=seed)
+    return obs
+
+
+def fit(obs: "Observation", seed: int, console: Console, preset: str = "default") -> "VPrismMap":
+    """Fit a map with the default or the paper's settings."""
+    from vprism_plan.mapping import MapConfig, fit_map
+
+    config = MapConfig.paper() if preset == "paper" else MapConfig()
+    with console.stage("fit"):
+        return fit_map(obs, config, seed=seed)
+
+
+def describe_map(m: "VPrismMap") -> dict[str, Any]:
+    """Return the sizes of a map, and where its objects were seen."""
+    seen = [view.points() for view in m.views]
+    objects = {}
+    for object_id in m.object_ids:
+        points = np.concatenate([p[labels == object_id] for p, labels in seen])
+        objects[str(object_id)] = {
+            "points": len(points),
+            "lower": points.min(axis=0),
+            "upper": points.max(axis=0),
+        }
+    return {
+        "objects": objects,
+        "hinge_points": len(m.hinge_points),
+        "iterations": len(m.history),
+        "bound": float(m.history[-1]),
+        "views": len(m.views),
+        "plane": {"normal": m.plane.normal, "offset": m.plane.offset},
+    }
+
+
+def run_map(command: Map, console: Console) -> int:
+    """Fit and save; exit code 0."""
+    if command.output.is_dir():
+        raise ObservationError(f"{command.output} is a folder; --output must name a file")
+    obs = observe(command.input, command.frame, command.seed, console)
+    m = fit(obs, command.seed, console, command.preset)
+    with console.stage("save"), replacing(command.output) as temporary:
+        m.save(temporary)
+    size = command.output.stat().st_size
+    payload = {
+        "output": command.output,
+        "bytes": size,
+        "map": describe_map(m),
+        "segmented": "segment" in console.timings,
+        "aligned": "align" in console.timings,
+        "seed": command.seed,
+        "timings": console.timings,
+        "compile_seconds": console.compile_seconds,
+    }
+    ids = ", ".join(str(i) for i in m.object_ids)
+    how = " (segmented from geometry)" if payload["segmented"] else ""
+    lines = [
+        f"{len(m.object_ids)} objects{how}: {ids}",
+        f"{len(m.hinge_points)} hinge points, {len(m.history)} iterations",
+        time_line(console),
+        f"wrote {command.output} ({size / 1e6:.1f} MB)",
+    ]
+    console.finish(payload, lines)
+    return 0
+
+
+def write_meshes(m: "VPrismMap", folder: Path, level: float, resolution: float) -> dict[int, Any]:
+    """Write one PLY per object into `folder`; return the meshes."""
+    from vprism_plan.world import extract_meshes
+
+    meshes = extract_meshes(m, level=level, resolution=resolution)
+    folder.mkdir(parents=True, exist_ok=True)
+    for object_id, mesh in meshes.items():
+        (folder / f"object_{object_id}.ply").write_bytes(mesh.export(file_type="ply"))
+    return meshes
+
+
+def run_mesh(command: Mesh, console: Console) -> int:
+    """Write the surfaces; exit code 0, or 1 if no object reaches the level."""
+    from vprism_plan.mapping import load_map
+
+    with console.stage("load"):
+        m = load_map(command.map)
+    with staged(command.output, MESH_FILES) as aside, console.stage("mesh"):
+        meshes = write_meshes(m, aside, command.level, command.resolution)
+    missing = [i for i in m.object_ids if i not in meshes]
+    payload = {
+        "output": command.output,
+        "objects": {
+            str(i): {
+                "file": command.output / f"object_{i}.ply",
+                "triangles": len(mesh.faces),
+                "volume": float(mesh.volume),
+            }
+            for i, mesh in meshes.items()
+        },
+        "without_surface": missing,
+        "timings": console.timings,
+        "compile_seconds": console.compile_seconds,
+    }
+    lines = [
+        f"{command.output / f'object_{i}.ply'}: {len(mesh.faces)} triangles, "
+        f"{1e6 * float(mesh.volume):.0f} cm^3"
+        for i, mesh in meshes.items()
+    ]
+    if missing:
+        lines.append(f"no surface at level {command.level:g}: objects {missing}")
+    console.finish(payload, lines)
+    return 0 if meshes else 1
+
+
+def time_line(console: Console) -> str:
+    """Return the stages and their seconds as one line."""
+    stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in console.timings.items())
+    note = console.compile_note()
+    return f"{stages}; {note}" if note else stages

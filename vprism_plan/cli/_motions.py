@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Commands about a robot in a map: `plan` and `query`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from vprism_plan.cli._commands import Plan, Query
+from vprism_plan.cli._console import Console
+from vprism_plan.cli._maps import fit, observe
+from vprism_plan.cli._outcome import Situation, report_plan
+from vprism_plan.cli._placing import (
+    Surroundings,
+    base_pose,
+    candidate_bases,
+    reach_for,
+    stands_free,
+)
+from vprism_plan.errors import PlanningError
+
+if TYPE_CHECKING:
+    from vprism_plan.collision import CollisionChecker
+    from vprism_plan.mapping import VPrismMap
+    from vprism_plan.robots import Robot
+    from vprism_plan.world import World
+
+
+class _Setup(Protocol):
+    """What `plan` and `query` have in common."""
+
+    robot: Path
+    base_xyz: tuple[float, float, float] | None
+    base_yaw: float | None
+    margin: float
+    occluded: Any
+    unobserved: Any
+    seed: int
+
+
+class NoPlaceError(Exception):
+    """Nothing sensible was found for what the user left open: an answer, not bad input."""
+
+
+def run_plan(command: Plan, console: Console) -> int:
+    """Plan and write the results; exit code 0, or 1 without a verified path."""
+    from vprism_plan.robots import Robot
+
+    robot = Robot.from_urdf(command.robot)  # before the long work: the file may be wrong
+    _check_lengths(command, robot)
+    m = _map_from(command.input, command.frame, command.seed, console)
+    world = _bake(m, command, console)
+    try:
+        with console.stage("place"):
+            situation = _place(command, robot, world)
+    except NoPlaceError as error:
+        console.finish(
+            {"status": "no_place", "message": str(error), "timings": console.timings},
+            [f"no safe answer: {error}"],
+        )
+        return 1
+    return solve(
+        situation,
+        planner=command.planner,
+        time_limit=command.time_limit,
+        seed=command.seed,
+        output=command.output,
+        console=console,
+    )
+
+
+def solve(
+    situation: Situation,
+    *,
+    planner: str,
+    time_limit: float,
+    seed: int,
+    output: Path,
+    console: Console,
+) -> int:
+    """Plan in a prepared situation, write everything, report; return the exit code."""
+    from vprism_plan.planning import plan
+
+    with console.stage("plan"):
+        result = plan(
+            situation.checker,
+            situation.start,
+            situation.goal,
+            planner=planner,
+            time_limit=time_limit,
+            seed=seed,
+        )
+    return report_plan(situation, result, output, console)
+
+
+def run_query(command: Query, console: Console) -> int:
+    """Answer for one configuration; exit code 0 if it is free, else 1."""
+    from vprism_plan.mapping import load_map
+    from vprism_plan.robots import Robot
+
+    robot = Robot.from_urdf(command.robot)
+    q = robot.check_configuration(command.q)
+    with console.stage("load"):
+        m = load_map(command.map)
+    world = _bake(m, command, console)
+    robot = _standing(command, robot, world, Surroundings.of(m))
+    checker = _checker(world, robot, command.margin)
+    report = checker.explain(q)
+    base = robot.base_pose
+    payload = {
+        **report.to_dict(),
+        "text": report.text(),
+        "base_pose": base,
+        "timings": console.timings,
+        "compile_seconds": console.compile_seconds,
+    }
+    verdict = "free" if report.valid else "refused"
+    lines = [
+        f"{verdict}: clearance {1000 * report.clearance:.1f} mm (required "
+        f"{1000 * report.margin:.1f} mm), self-clearance {1000 * report.self_clearance:.1f} mm",
+        *(f"  {contact.text()}" for contact in report.contacts),
+        "volume not seen: "
+        + (", ".join(f"{k} {100 * v:.0f} %" for k, v in report.shares.items()) or "none"),
+        f"base at {np.round(base[:3, 3], 3).tolist()} m",
+    ]
+    console.finish(payload, lines)
+    return 0 if report.valid else 1
+
+
+def _map_from(path: Path, frame: int | None, seed: int, console: Console) -> "VPrismMap":
+    if path.suffix != ".safetensors":
+        return fit(observe(path, frame, seed, console), seed, console)
+    from vprism_plan.mapping import load_map
+
+    with console.stage("load"):
+        return load_map(path)
+
+
+def _bake(m: "VPrismMap", command: _Setup, console: Console) -> "World":
+    from vprism_plan.world import World, WorldConfig
+
+    config = WorldConfig(occluded=command.occluded, unobserved=command.unobserved)
+    with console.stage("bake"):
+        return World(m, config)
+
+
+def _checker(world: "World", robot: "Robot", margin: float) -> "CollisionChecker":
+    from vprism_plan.collision import CheckerConfig, CollisionChecker
+
+    return CollisionChecker(world, robot, CheckerConfig(margin=margin))
+
+
+def _check_lengths(command: Plan, robot: "Robot") -> None:
+    """Refuse malformed configurations before the long work.
+
+    Raises:
+        PlanningError, RobotError: what is wrong.
+    """
+    if command.goal is not None and command.goal_pose is not None:
+        raise PlanningError("both --goal and --goal-pose are given; give one of them")
+    for q in (command.start, command.goal):
+        if q is not None:
+            robot.check_configuration(q)
+    if command.goal_pose is not None:
+        pose_matrix(command.goal_pose)
+
+
+def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
+    """Return (4, 4) from x y z (m) and a quaternion in wxyz order of unit length."""
+    x, y, z, qw, qx, qy, qz = pose
+    quaternion = np.array([qx, qy, qz, qw])
+    length = float(np.linalg.norm(quaternion))
+    if not (np.isfinite(pose).all() and abs(length - 1.0) < 1e-3):
+        raise PlanningError(
+            f"--goal-pose has the quaternion {pose[3:]} of length {length:.4g}; give finite "
+            "x y z (m) and qw qx qy qz of length 1"
+        )
+    from scipy.spatial.transform import Rotation
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(quaternion / length).as_matrix()
+    matrix[:3, 3] = (x, y, z)
+    return matrix
+
+
+def _standing(command: _Setup, robot: "Robot", world: "World", around: Surroundings) -> "Robot":
+    """Return the robot on the base that was given, else on the first free place."""
+    if command.base_xyz is not None:
+        return robot.with_base_pose(base_pose(np.array(command.base_xyz), around, command.base_yaw))
+    for pose in candidate_bases(robot, around):
+        placed = robot.with_base_pose(base_pose(pose[:3, 3], around, command.base_yaw))
+        if stands_free(placed, world):
+            return placed
+    raise PlanningError("no free place for the base beside the objects; give --base-xyz")
+
+
+def _place(command: Plan, robot: "Robot", world: "World") -> Situation:
+    """Return robot, checker, start and goal; what is open is chosen so that it is valid.
+
+    Raises:
+        NoPlaceError: no valid start and goal on both sides of the objects.
+    """
+    around = Surroundings.of(world.map)
+    if command.base_xyz is not None:
+        poses = [base_pose(np.array(command.base_xyz), around, command.base_yaw)]
+    else:
+        poses = [
+            base_pose(pose[:3, 3], around, command.base_yaw)
+            for pose in candidate_bases(robot, around)
+        ]
+    for number, pose in enumerate(poses):
+        placed = robot.with_base_pose(pose)
+        if command.base_xyz is None and not stands_free(placed, world):
+            continue
+        checker = _checker(world, placed, command.margin)
+        rng = np.random.default_rng([command.seed, number])
+        ends = choose_ends(
+            checker,
+            around,
+            rng,
+            start=command.start,
+            goal=command.goal if command.goal_pose is None else pose_matrix(command.goal_pose),
+        )
+        if ends is not None:
+            chosen = [
+                name
+                for name, given in (
+                    ("base", command.base_xyz),
+                    ("start", command.start),
+                    ("goal", command.goal or command.goal_pose),
+                )
+                if given is None
+            ]
+            return Situation(checker, *ends, tuple(chosen))
+    where = "from the given base" if command.base_xyz is not None else "from any base beside them"
+    raise NoPlaceError(
+        f"the hand has no valid configuration on both sides of the objects {where}; "
+        "give --base-xyz, --start and --goal"
+    )
+
+
+def choose_ends(
+    checker: "CollisionChecker",
+    around: Surroundings,
+    rng: np.random.Generator,
+    *,
+    start: Any = None,
+    goal: Any = None,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return start and goal; what is None is chosen on the other side of the objects.
+
+    A given start or goal is kept as it is, valid or not: that verdict is the planner's.
+    None if nothing valid was found for what is open.
+    """
+    from vprism_plan.viz import hand_path
+
+    robot = checker.robot
+    sides = around.sides(robot.base_pose[:3, 3])
+    left = sides[1] - sides[0]
+    left = left / np.linalg.norm(left)
+    middle = np.array([*around.middle, 0.0])
+
+    def side_of(end: np.ndarray) -> float:
+        at = end[:3, 3] if end.shape == (4, 4) else hand_path(robot, end[None])[0]
+        return 1.0 if (at - middle) @ left > 0 else -1.0
+
+    def reach(sign: float) -> np.ndarray | None:
+        edge = around.half_width(left[:2])
+        target = sides[1 if sign > 0 else 0]
+        return reach_for(checker, target, lambda hand: sign * ((hand - middle) @ left) > edge, rng)
+
+    first = None if start is None else np.asarray(start, dtype=np.float64)
+    last = None if goal is None else np.asarray(goal, dtype=np.float64)
+    if first is None:
+        first = reach(-1.0 if last is None else -side_of(last))
+    if first is not None and last is None:
+        last = reach(-side_of(first))
+    return None if first is None or last is None else (first, last)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where a robot could stand, start and end, when the user does not say."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.errors import PlanningError
+
+if TYPE_CHECKING:
+    from vprism_plan.collision import CollisionChecker
+    from vprism_plan.mapping import VPrismMap
+    from vprism_plan.robots import Robot
+    from vprism_plan.world import World
+
+# Around the objects, from the camera's side: what the camera hides lies opposite.
+_BEARINGS = np.deg2rad([0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0])
+_SHARES_OF_REACH = (0.5, 0.4, 0.6, 0.7)
+_ASIDE = 0.12  # metres between the objects' edge and where the hand starts or ends
+_ACCEPT = 0.15  # metres between the hand and where it should be
+_SAMPLES = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The objects as seen from above: middle, half widths, the camera; metres."""
+
+    middle: Float[np.ndarray, "2"]
+    points: Float[np.ndarray, "n 3"]
+    table: float
+    camera: Float[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, m: "VPrismMap") -> "Surroundings":
+        """Measure the labelled points of a map.
+
+        Raises:
+            PlanningError: the world is not z up, so nothing can be placed on the table.
+        """
+        normal = m.plane.normal
+        if normal[2] < 0.9:
+            raise PlanningError(
+                f"the table's normal is {np.round(normal, 3).tolist()} in this map, but a base is "
+                "placed for a world with z up; give --base-xyz, or a view without a camera pose"
+            )
+        seen = [view.points() for view in m.views]
+        points = np.concatenate([p[labels > 0] for p, labels in seen])
+        low, high = np.percentile(points, [1.0, 99.0], axis=0)
+        middle = 0.5 * (low + high)[:2]
+        table = (m.plane.offset - float(normal[:2] @ middle)) / float(normal[2])
+        return cls(middle, points, table, m.views[0].camera_center)
+
+    def half_width(self, direction: Float[np.ndarray, "2"]) -> float:
+        """Return how far the objects reach from their middle along a direction, metres."""
+        return float(np.percentile(np.abs((self.points[:, :2] - self.middle) @ direction), 99.0))
+
+    def sides(self, base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
+        """Return where the hand should be right and left of the objects, seen from a base."""
+        ahead = self.middle - base[:2]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+        left = np.array([-ahead[1], ahead[0]])
+        away = self.half_width(left) + _ASIDE
+        height = self.table + 0.12 + 0.5 * (float(self.points[:, 2].max()) - self.table)
+        return np.array([[*(self.middle + s * away * left), height] for s in (-1.0, 1.0)])
+
+
+def base_pose(
+    xyz: Float[np.ndarray, "3"], around: Surroundings, yaw: float | None
+) -> Float[np.ndarray, "4 4"]:
+    """Return the pose of a base that stands upright, facing the objects unless yaw is given."""
+    if yaw is None:
+        ahead = around.middle - np.asarray(xyz)[:2]
+        yaw = float(np.arctan2(ahead[1], ahead[0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = xyz
+    return pose
+
+
+def stands_free(robot: "Robot", world: "World") -> bool:
+    """Return whether the links that never move keep clear of everything but the table."""
+    from vprism_plan.viz import sphere_centers
+
+    fixed = np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
+    if not fixed.any():
+        return True
+    centers = sphere_centers(robot, robot.neutral[None])[0][fixed]
+    return bool((world.field.lower_bound(centers) > robot.sphere_radii[fixed]).all())
+
+
+def candidate_bases(robot: "Robot", around: Surroundings) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """Yield places beside the objects, most sensible first."""
+    towards = around.camera[:2] - around.middle
+    bearing = float(np.arctan2(towards[1], towards[0])) if np.linalg.norm(towards) > 0.05 else 0.0
+    # The bound on reach adds up links that cannot all be stretched at once.
+    reach = min(robot.reach, 1.1)
+    for turn in _BEARINGS:
+        direction = np.array([np.cos(bearing + turn), np.sin(bearing + turn)])
+        for share in _SHARES_OF_REACH:
+            distance = max(share * reach, around.half_width(direction) + 0.2)
+            xy = around.middle + distance * direction
+            yield base_pose(np.array([*xy, around.table]), around, None)
+
+
+def reach_for(
+    checker: "CollisionChecker",
+    target: Float[np.ndarray, "3"],
+    beyond: Callable[[np.ndarray], np.ndarray],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "dof"] | None:
+    """Return a valid configuration with the hand near `target` (metres), or None.
+
+    Samples around the robot's neutral posture, then around the best ones, so that the
+    posture stays natural. `beyond` says of hand positions (n, 3) which are on the right side.
+    """
+    from vprism_plan.viz import hand_path
+
+    robot = checker.robot
+    span = robot.upper - robot.lower
+    best = np.asarray(robot.neutral)[None]
+    found, score = None, np.inf
+    for spread in (0.25, 0.25, 0.08, 0.03, 0.01):
+        seeds = best[rng.integers(len(best), size=_SAMPLES)]
+        sample = np.clip(
+            seeds + spread * span * rng.standard_normal(seeds.shape), robot.lower, robot.upper
+        )
+        sample = np.concatenate([best, sample])
+        hand = hand_path(robot, sample)
+        odd = np.abs((sample - robot.neutral) / span).mean(axis=1)
+        cost = np.linalg.norm(hand - target, axis=1) + 0.25 * odd
+        cost[~checker.is_valid_batch(sample)] += 10.0
+        cost[~beyond(hand)] += 10.0
+        order = np.argsort(cost, kind="stable")
+        best = sample[order[:16]]
+        if cost[order[0]] < min(score, 10.0):
+            found, score = best[0], float(cost[order[0]])
+            near = bool(np.linalg.norm(hand[order[0]] - target) < _ACCEPT)
+    return found if found is not None and near else None
