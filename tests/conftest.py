@@ -38,3 +38,51 @@ def real_frames(repository: Path) -> list[Path]:
     if not frames:
         pytest.skip("the real depth images (../shared/data/real) are not on this machine")
     return frames
+
+
+@pytest.fixture(scope="session")
+def demo_map():
+    """Default map of the bundled scene."""
+    import vprism_plan as vp
+
+    return vp.fit_map(vp.load_observation(vp_data("demo_scene")), vp.MapConfig(), seed=0)
+
+
+@pytest.fixture(scope="session")
+def demo_world(demo_map):
+    """Default world of the bundled scene."""
+    import vprism_plan as vp
+
+    return vp.World(demo_map)
+
+
+def vp_data(name: str) -> Path:
+    """Path of bundled data."""
+    import vprism_plan
+
+    return Path(vprism_plan.__file__).parent / "data" / name
+
+
+_BALL_URDF = """<robot name="ball">
+  <link name="world"/><link name="x"/><link name="y"/><link name="ball"/>
+  {joints}
+</robot>"""
+_SLIDE = """<joint name="{n}" type="prismatic"><parent link="{p}"/><child link="{c}"/>
+  <axis xyz="{a}"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint>"""
+
+
+@pytest.fixture(scope="session")
+def ball_robot(tmp_path_factory):
+    """A function that makes a sphere of a given radius (metres) that moves freely in space."""
+    import vprism_plan as vp
+
+    chain = [("x", "world", "x", "1 0 0"), ("y", "x", "y", "0 1 0"), ("z", "y", "ball", "0 0 1")]
+    joints = "\n".join(_SLIDE.format(n=n, p=p, c=c, a=a) for n, p, c, a in chain)
+    path = tmp_path_factory.mktemp("robots") / "ball.urdf"
+    path.write_text(_BALL_URDF.format(joints=joints))
+
+    def make(radius: float):
+        spheres = {"ball": [{"center": [0.0, 0.0, 0.0], "radius": radius}]}
+        return vp.Robot.from_urdf(path, spheres=spheres)
+
+    return make

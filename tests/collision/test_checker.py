@@ -52,9 +52,9 @@ def test_compiled_kinematics_equal_products_of_matrices(seed):
     arrays = random_arrays(rng, dof=int(rng.integers(1, 7)))
     packed = pack_robot(arrays)
     q = random_q(rng, arrays)
-    centers = np.empty((len(arrays.sphere_radius), 3))
+    centers = np.empty((3, len(arrays.sphere_radius)))
     kernels.place_spheres(q, packed.floats, packed.ints, centers)
-    np.testing.assert_allclose(centers, sphere_positions(arrays, q), atol=1e-12)
+    np.testing.assert_allclose(centers.T, sphere_positions(arrays, q), atol=1e-12)
 
 
 @settings(max_examples=60, deadline=None)

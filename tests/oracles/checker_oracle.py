@@ -67,7 +67,7 @@ class BallWorld:
         return SimpleNamespace(
             field=baked,
             planes=self.planes,
-            plane_names=tuple(f"plane{i}" for i in range(len(self.planes))),
+            plane_names=("support surface", "known:wall")[: len(self.planes)],
             sources=tuple(f"object:{i + 1}" for i in range(len(self.radii))),
             config=SimpleNamespace(occluded="occupied", unobserved=unobserved),
             map=SimpleNamespace(occupancy=lambda x: (self.distance(x) < 0).astype(float)),

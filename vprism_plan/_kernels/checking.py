@@ -10,8 +10,8 @@ robot floats `rf`, robot integers `ri`:
     ri[8:16]  = offsets into ri of: frame ints (parent, kind, q index), link ints
                 (frame, first sphere, end sphere, fixed), pairs (a, b), continuous flags
     ri[16:24] = offsets into rf of: frame floats (R 9, t 3, multiplier, offset), spheres
-                (x, y, z, radius), link bounding spheres (x, y, z, radius), limits
-                (lower, upper), reach table (n_frames, n_links), self margin
+                (all x, all y, all z, all radii), link bounding spheres (x, y, z,
+                radius), limits (lower, upper), reach table (n_frames, n_links), self margin
 
 Frame 0 is the base; every other frame moves about or along its own z axis.
 
@@ -64,24 +64,38 @@ def fk_frames(q, rf, ri, T):
             T[i, 9 + r] = t
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _place_link(link, T, rf, ri, C):
+    """Fill the columns of C (3, n_spheres) that hold a link's world sphere centres."""
+    li = ri[9] + 4 * link
+    f = ri[li]
+    n = ri[1]
+    xo = ri[17]
+    yo = xo + n
+    zo = yo + n
+    for row in range(3):
+        a = T[f, 3 * row]
+        b = T[f, 3 * row + 1]
+        c = T[f, 3 * row + 2]
+        t = T[f, 9 + row]
+        for s in range(ri[li + 1], ri[li + 2]):
+            C[row, s] = a * rf[xo + s] + b * rf[yo + s] + c * rf[zo + s] + t
+
+
 @njit(cache=True, nogil=True)
-def place_spheres(q, rf, ri, centers):
-    """Fill centers (n_spheres, 3) with world sphere centres: the kinematics twin."""
+def place_spheres(q, rf, ri, C):
+    """Fill C (3, n_spheres) with world sphere centres: the kinematics twin."""
     T = np.empty((ri[0], 12))
     fk_frames(q, rf, ri, T)
-    li = ri[9]
-    so = ri[17]
     for link in range(ri[2]):
-        f = ri[li + 4 * link]
-        for s in range(ri[li + 4 * link + 1], ri[li + 4 * link + 2]):
-            _transform(T, f, rf, so + 4 * s, centers, s)
+        _place_link(link, T, rf, ri, C)
 
 
 @njit(cache=True, nogil=True)
-def place_spheres_batch(Q, rf, ri, centers):
-    """Fill centers (n, n_spheres, 3) for configurations Q (n, dof)."""
+def place_spheres_batch(Q, rf, ri, C):
+    """Fill C (n, 3, n_spheres) for configurations Q (n, dof)."""
     for n in range(Q.shape[0]):
-        place_spheres(Q[n], rf, ri, centers[n])
+        place_spheres(Q[n], rf, ri, C[n])
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -94,7 +108,7 @@ def _transform(T, f, rf, o, out, row):
     out[row, 2] = T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def field_bound(D, wf, x, y, z, enough):
     """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
 
@@ -144,7 +158,7 @@ def field_bound(D, wf, x, y, z, enough):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def plane_bound(wf, x, y, z):
     """Distance from a point to the nearest half-space obstacle (exact for each one)."""
     best = _INF
@@ -160,7 +174,7 @@ def world_bound(D, wf, x, y, z, enough):
     return min(plane_bound(wf, x, y, z), field_bound(D, wf, x, y, z, enough))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def within_limits(q, rf, ri):
     """Whether every joint is finite and, unless continuous, inside its limits."""
     lo = ri[19]
@@ -175,45 +189,48 @@ def within_limits(q, rf, ri):
 
 
 @njit(cache=True, nogil=True)
-def _place_links(T, rf, ri, lc):
-    """Fill lc (n_links, 3) with the world centres of the links' bounding spheres."""
-    for link in range(ri[2]):
-        _transform(T, ri[ri[9] + 4 * link], rf, ri[18] + 4 * link, lc, link)
+def _world_clear(T, lc, C, placed, rf, ri, D, wf):
+    """Whether every moving link keeps more than the margin from the world.
 
-
-@njit(cache=True, nogil=True)
-def _link_clear(link, T, lc, rf, ri, D, wf, margin, row):
-    """Whether a link keeps more than `margin` from the world; its bounding sphere first."""
-    need = margin + rf[ri[18] + 4 * link + 3]
-    x = lc[link, 0]
-    y = lc[link, 1]
-    z = lc[link, 2]
-    plane_ok = plane_bound(wf, x, y, z) > need
-    field_ok = field_bound(D, wf, x, y, z, need) > need
-    if plane_ok and field_ok:
-        return True
-    li = ri[9] + 4 * link
-    so = ri[17]
-    f = ri[li]
-    for s in range(ri[li + 1], ri[li + 2]):
-        _transform(T, f, rf, so + 4 * s, row, 0)
-        x = row[0, 0]
-        y = row[0, 1]
-        z = row[0, 2]
-        need = margin + rf[so + 4 * s + 3]
-        if not plane_ok and not plane_bound(wf, x, y, z) > need:
-            return False
-        if not field_ok and not field_bound(D, wf, x, y, z, need) > need:
-            return False
+    Bounding spheres first; one loop without calls, since each call would pass (and
+    count references of) all arrays anew.
+    """
+    margin = wf[6]
+    ro = ri[17] + 3 * ri[1]
+    # Distal links first: the hand is what hits things.
+    for link in range(ri[2] - 1, -1, -1):
+        li = ri[9] + 4 * link
+        if ri[li + 3] != 0:
+            continue
+        need = margin + rf[ri[18] + 4 * link + 3]
+        x = lc[link, 0]
+        y = lc[link, 1]
+        z = lc[link, 2]
+        plane_ok = plane_bound(wf, x, y, z) > need
+        field_ok = field_bound(D, wf, x, y, z, need) > need
+        if plane_ok and field_ok:
+            continue
+        if not placed[link]:
+            placed[link] = True
+            _place_link(link, T, rf, ri, C)
+        for s in range(ri[li + 1], ri[li + 2]):
+            x = C[0, s]
+            y = C[1, s]
+            z = C[2, s]
+            need = margin + rf[ro + s]
+            if not plane_ok and not plane_bound(wf, x, y, z) > need:
+                return False
+            if not field_ok and not field_bound(D, wf, x, y, z, need) > need:
+                return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def _link_clearance(link, T, lc, rf, ri, D, wf, enough, row):
+def _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, enough):
     """Lower bound of the distance from a link to the world, exact per sphere below `enough`.
 
     A sphere is never nearer than the link's bounding sphere, so each bound is the
-    larger of the two: that keeps this consistent with `_link_clear`.
+    larger of the two: that keeps this consistent with `_world_clear`.
     """
     r = rf[ri[18] + 4 * link + 3]
     x = lc[link, 0]
@@ -223,152 +240,180 @@ def _link_clearance(link, T, lc, rf, ri, D, wf, enough, row):
     field_all = field_bound(D, wf, x, y, z, _INF) - r
     if min(plane_all, field_all) >= enough:
         return min(plane_all, field_all)
+    if not placed[link]:
+        placed[link] = True
+        _place_link(link, T, rf, ri, C)
     best = _INF
     li = ri[9] + 4 * link
-    so = ri[17]
-    f = ri[li]
+    ro = ri[17] + 3 * ri[1]
     for s in range(ri[li + 1], ri[li + 2]):
-        _transform(T, f, rf, so + 4 * s, row, 0)
-        x = row[0, 0]
-        y = row[0, 1]
-        z = row[0, 2]
-        r = rf[so + 4 * s + 3]
+        x = C[0, s]
+        y = C[1, s]
+        z = C[2, s]
+        r = rf[ro + s]
         plane = max(plane_bound(wf, x, y, z) - r, plane_all)
-        # Beyond the best so far a cheaper, smaller bound would do, but not the same number.
         field = max(field_bound(D, wf, x, y, z, _INF) - r, field_all)
         best = min(best, plane, field)
     return best
 
 
 @njit(cache=True, nogil=True)
-def _near_spheres(link, other, T, lc, rf, ri, enough, out):
-    """Collect a link's spheres that may come within `enough` of the other link's ball.
-
-    Fills rows of out with x, y, z, radius and returns how many.
-    """
-    li = ri[9] + 4 * link
-    so = ri[17]
-    f = ri[li]
-    ball = rf[ri[18] + 4 * other + 3] + enough
-    x = lc[other, 0]
-    y = lc[other, 1]
-    z = lc[other, 2]
-    n = 0
-    for s in range(ri[li + 1], ri[li + 2]):
-        _transform(T, f, rf, so + 4 * s, out, n)
-        r = rf[so + 4 * s + 3]
-        d2 = (out[n, 0] - x) ** 2 + (out[n, 1] - y) ** 2 + (out[n, 2] - z) ** 2
-        bound = r + ball
-        if d2 <= bound * bound:
-            out[n, 3] = r
-            n += 1
-    return n
+def _place_pair(a, b, T, C, placed, rf, ri):
+    """Make sure that the spheres of both links are placed."""
+    if not placed[a]:
+        placed[a] = True
+        _place_link(a, T, rf, ri, C)
+    if not placed[b]:
+        placed[b] = True
+        _place_link(b, T, rf, ri, C)
 
 
 @njit(cache=True, nogil=True)
-def _pair_gap(pair, T, lc, rf, ri, enough, ca, cb):
-    """Gap between two links: exact if at most `enough`, else some value above `enough`."""
-    a = ri[ri[10] + 2 * pair]
-    b = ri[ri[10] + 2 * pair + 1]
+def _self_clear(T, lc, C, placed, rf, ri):
+    """Whether every pair of links keeps more than the self margin; bounding spheres first."""
+    margin = rf[ri[21]]
     bo = ri[18]
-    d2 = (lc[a, 0] - lc[b, 0]) ** 2 + (lc[a, 1] - lc[b, 1]) ** 2 + (lc[a, 2] - lc[b, 2]) ** 2
-    reach = rf[bo + 4 * a + 3] + rf[bo + 4 * b + 3]
-    if d2 > (reach + enough) ** 2:
-        return np.sqrt(d2) - reach
-    na = _near_spheres(a, b, T, lc, rf, ri, enough, ca)
-    if na == 0:
-        return np.nextafter(enough, _INF)
-    nb = _near_spheres(b, a, T, lc, rf, ri, enough, cb)
-    la = ri[9] + 4 * a
-    lb = ri[9] + 4 * b
-    left_out = na < ri[la + 2] - ri[la + 1] or nb < ri[lb + 2] - ri[lb + 1]
-    best = np.nextafter(enough, _INF) if left_out else _INF
-    for s in range(na):
-        x = ca[s, 0]
-        y = ca[s, 1]
-        z = ca[s, 2]
-        ra = ca[s, 3]
-        for t in range(nb):
-            d2 = (x - cb[t, 0]) ** 2 + (y - cb[t, 1]) ** 2 + (z - cb[t, 2]) ** 2
-            bound = ra + cb[t, 3] + best
-            if bound < 0.0 or d2 < bound * bound:
-                best = min(best, np.sqrt(d2) - ra - cb[t, 3])
-    return best
-
-
-@njit(cache=True, nogil=True)
-def _state_valid(q, rf, ri, D, wf, T, lc, ca, cb):
-    if not within_limits(q, rf, ri):
-        return False
-    fk_frames(q, rf, ri, T)
-    _place_links(T, rf, ri, lc)
-    margin = wf[6]
-    li = ri[9]
-    # Distal links first: the hand is what hits things.
-    for link in range(ri[2] - 1, -1, -1):
-        if ri[li + 4 * link + 3] == 0 and not _link_clear(link, T, lc, rf, ri, D, wf, margin, ca):
-            return False
-    self_margin = rf[ri[21]]
+    ro = ri[17] + 3 * ri[1]
     for pair in range(ri[3]):
-        if not _pair_gap(pair, T, lc, rf, ri, self_margin, ca, cb) > self_margin:
-            return False
+        a = ri[ri[10] + 2 * pair]
+        b = ri[ri[10] + 2 * pair + 1]
+        x = lc[b, 0]
+        y = lc[b, 1]
+        z = lc[b, 2]
+        d2 = (lc[a, 0] - x) ** 2 + (lc[a, 1] - y) ** 2 + (lc[a, 2] - z) ** 2
+        ball = rf[bo + 4 * b + 3] + margin
+        reach = rf[bo + 4 * a + 3] + ball
+        if d2 > reach * reach:
+            continue
+        _place_pair(a, b, T, C, placed, rf, ri)
+        b0 = ri[ri[9] + 4 * b + 1]
+        b1 = ri[ri[9] + 4 * b + 2]
+        for s in range(ri[ri[9] + 4 * a + 1], ri[ri[9] + 4 * a + 2]):
+            px = C[0, s]
+            py = C[1, s]
+            pz = C[2, s]
+            bound = rf[ro + s] + ball
+            if (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2 > bound * bound:
+                continue
+            ra = rf[ro + s] + margin
+            touching = False
+            for t in range(b0, b1):  # no early exit: this loop vectorises
+                d2 = (px - C[0, t]) ** 2 + (py - C[1, t]) ** 2 + (pz - C[2, t]) ** 2
+                bound = ra + rf[ro + t]
+                touching |= d2 <= bound * bound
+            if touching:
+                return False
     return True
 
 
 @njit(cache=True, nogil=True)
+def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
+    """Gap between two links: exact if at most `enough`, else some value above `enough`."""
+    a = ri[ri[10] + 2 * pair]
+    b = ri[ri[10] + 2 * pair + 1]
+    bo = ri[18]
+    x = lc[b, 0]
+    y = lc[b, 1]
+    z = lc[b, 2]
+    d2 = (lc[a, 0] - x) ** 2 + (lc[a, 1] - y) ** 2 + (lc[a, 2] - z) ** 2
+    ball = rf[bo + 4 * b + 3]
+    reach = rf[bo + 4 * a + 3] + ball
+    if d2 > (reach + enough) ** 2:
+        return np.sqrt(d2) - reach
+    _place_pair(a, b, T, C, placed, rf, ri)
+    la = ri[9] + 4 * a
+    lb = ri[9] + 4 * b
+    ro = ri[17] + 3 * ri[1]
+    best = _INF
+    for s in range(ri[la + 1], ri[la + 2]):
+        px = C[0, s]
+        py = C[1, s]
+        pz = C[2, s]
+        ra = rf[ro + s]
+        d2 = (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2
+        bound = ra + ball + enough
+        if d2 > bound * bound:
+            best = min(best, np.sqrt(d2) - ra - ball)
+            continue
+        for t in range(ri[lb + 1], ri[lb + 2]):
+            d2 = (px - C[0, t]) ** 2 + (py - C[1, t]) ** 2 + (pz - C[2, t]) ** 2
+            best = min(best, np.sqrt(d2) - ra - rf[ro + t])
+    return best
+
+
+@njit(cache=True, nogil=True)
 def _scratch(ri):
-    """Room for frame poses, link centres, and the spheres of two links."""
-    most = ri[5]
-    return np.empty((ri[0], 12)), np.empty((ri[2], 3)), np.empty((most, 4)), np.empty((most, 4))
+    """Room for frame poses, link centres, sphere centres and which links are placed."""
+    n_links = ri[2]
+    C = np.empty((3, ri[1]))
+    return np.empty((ri[0], 12)), np.empty((n_links, 3)), C, np.empty(n_links, np.bool_)
+
+
+@njit(cache=True, nogil=True)
+def _pose(q, rf, ri, T, lc, placed):
+    """Place frames and link bounding spheres; no sphere is placed yet."""
+    fk_frames(q, rf, ri, T)
+    for link in range(ri[2]):
+        placed[link] = False
+        _transform(T, ri[ri[9] + 4 * link], rf, ri[18] + 4 * link, lc, link)
+
+
+@njit(cache=True, nogil=True)
+def _state_valid(q, rf, ri, D, wf, T, lc, C, placed):
+    if not within_limits(q, rf, ri):
+        return False
+    _pose(q, rf, ri, T, lc, placed)
+    if not _world_clear(T, lc, C, placed, rf, ri, D, wf):
+        return False
+    return _self_clear(T, lc, C, placed, rf, ri)
 
 
 @njit(cache=True, nogil=True)
 def is_valid(q, rf, ri, D, wf):
     """Whether a configuration is inside its limits and clear of the world and itself."""
-    T, lc, ca, cb = _scratch(ri)
-    return _state_valid(q, rf, ri, D, wf, T, lc, ca, cb)
+    T, lc, C, placed = _scratch(ri)
+    return _state_valid(q, rf, ri, D, wf, T, lc, C, placed)
 
 
 @njit(cache=True, nogil=True)
 def is_valid_batch(Q, rf, ri, D, wf, out):
     """Fill out (n,) with `is_valid` of each row of Q (n, dof)."""
-    T, lc, ca, cb = _scratch(ri)
+    T, lc, C, placed = _scratch(ri)
     for n in range(Q.shape[0]):
-        out[n] = _state_valid(Q[n], rf, ri, D, wf, T, lc, ca, cb)
+        out[n] = _state_valid(Q[n], rf, ri, D, wf, T, lc, C, placed)
 
 
 @njit(cache=True, nogil=True)
 def clearance_batch(Q, rf, ri, D, wf, world, own):
     """Fill world (n,) and own (n,): distance bounds to the world and between links, metres."""
-    T, lc, ca, cb = _scratch(ri)
+    T, lc, C, placed = _scratch(ri)
     li = ri[9]
     for n in range(Q.shape[0]):
-        fk_frames(Q[n], rf, ri, T)
-        _place_links(T, rf, ri, lc)
+        _pose(Q[n], rf, ri, T, lc, placed)
         best = _INF
         for link in range(ri[2]):
             if ri[li + 4 * link + 3] == 0:
-                best = min(best, _link_clearance(link, T, lc, rf, ri, D, wf, best, ca))
+                best = min(best, _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, best))
         world[n] = best
         gap = _INF
         for pair in range(ri[3]):
-            gap = min(gap, _pair_gap(pair, T, lc, rf, ri, gap, ca, cb))
+            gap = min(gap, _pair_gap(pair, T, lc, C, placed, rf, ri, gap))
         own[n] = gap
 
 
 @njit(cache=True, nogil=True)
-def sphere_clearances(q, rf, ri, D, wf, centers, plane, which, field):
+def sphere_clearances(q, rf, ri, D, wf, C, plane, which, field):
     """Per sphere: centre, distance to the nearest plane and its index, bound from the field.
 
     Every sphere's own values (no bounding spheres): what `explain` reports.
     """
-    place_spheres(q, rf, ri, centers)
-    so = ri[17]
+    place_spheres(q, rf, ri, C)
+    ro = ri[17] + 3 * ri[1]
     for s in range(ri[1]):
-        x = centers[s, 0]
-        y = centers[s, 1]
-        z = centers[s, 2]
-        r = rf[so + 4 * s + 3]
+        x = C[0, s]
+        y = C[1, s]
+        z = C[2, s]
+        r = rf[ro + s]
         plane[s] = _INF
         which[s] = -1
         for p in range(int(wf[5])):
@@ -384,10 +429,10 @@ def sphere_clearances(q, rf, ri, D, wf, centers, plane, which, field):
 def pair_gaps(q, rf, ri, gaps, spheres):
     """Fill gaps (n_pairs,) with the smallest sphere gap of each link pair, metres, and
     spheres (n_pairs, 2) with the two spheres that have it."""
-    centers = np.empty((ri[1], 3))
-    place_spheres(q, rf, ri, centers)
+    C = np.empty((3, ri[1]))
+    place_spheres(q, rf, ri, C)
     li = ri[9]
-    so = ri[17]
+    ro = ri[17] + 3 * ri[1]
     for pair in range(ri[3]):
         a = ri[ri[10] + 2 * pair]
         b = ri[ri[10] + 2 * pair + 1]
@@ -396,8 +441,8 @@ def pair_gaps(q, rf, ri, gaps, spheres):
             for t in range(ri[li + 4 * b + 1], ri[li + 4 * b + 2]):
                 d2 = 0.0
                 for k in range(3):
-                    d2 += (centers[s, k] - centers[t, k]) ** 2
-                gap = np.sqrt(d2) - rf[so + 4 * s + 3] - rf[so + 4 * t + 3]
+                    d2 += (C[k, s] - C[k, t]) ** 2
+                gap = np.sqrt(d2) - rf[ro + s] - rf[ro + t]
                 if gap < gaps[pair]:
                     gaps[pair] = gap
                     spheres[pair, 0] = s
@@ -442,7 +487,7 @@ def motion_rates(delta, rf, ri, link_rate, pair_rate):
 
 
 @njit(cache=True, nogil=True)
-def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, ca, cb):
+def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, C, placed):
     """How far along the edge (path parameter) a configuration's clearance reaches; < 0: invalid.
 
     Each link may move by its clearance, each pair by its gap, before anything can
@@ -450,8 +495,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, ca, cb):
     """
     if not within_limits(q, rf, ri):
         return -1.0
-    fk_frames(q, rf, ri, T)
-    _place_links(T, rf, ri, lc)
+    _pose(q, rf, ri, T, lc, placed)
     margin = wf[6]
     li = ri[9]
     span = longest
@@ -459,7 +503,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, ca, cb):
         if ri[li + 4 * link + 3] != 0:
             continue
         rate = link_rate[link]
-        c = _link_clearance(link, T, lc, rf, ri, D, wf, margin + span * rate, ca) - margin
+        c = _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, margin + span * rate) - margin
         if not c > 0.0:
             return -1.0
         if c < span * rate:
@@ -467,7 +511,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, ca, cb):
     self_margin = rf[ri[21]]
     for pair in range(ri[3]):
         rate = pair_rate[pair]
-        g = _pair_gap(pair, T, lc, rf, ri, self_margin + span * rate, ca, cb) - self_margin
+        g = _pair_gap(pair, T, lc, C, placed, rf, ri, self_margin + span * rate) - self_margin
         if not g > 0.0:
             return -1.0
         if g < span * rate:
@@ -509,16 +553,16 @@ def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
     pair_rate = np.empty(ri[3])
     total = motion_rates(delta, rf, ri, link_rate, pair_rate)
     stats[3] = total
-    T, lc, ca, cb = _scratch(ri)
+    T, lc, C, placed = _scratch(ri)
     q = np.empty(dof)
     lo = np.empty(128)
     hi = np.empty(128)
-    span_a = _safe_span(qa, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, ca, cb)
+    span_a = _safe_span(qa, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
     stats[1] = 1.0
     if span_a < 0.0:
         stats[0] = 0.0
         return False
-    span_b = _safe_span(qb, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, ca, cb)
+    span_b = _safe_span(qb, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
     stats[1] = 2.0
     if span_b < 0.0:
         stats[0] = 1.0
@@ -537,7 +581,7 @@ def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
         t = 0.5 * (a + b)
         for j in range(dof):
             q[j] = qa[j] + t * delta[j]
-        span = _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, ca, cb)
+        span = _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, C, placed)
         stats[1] += 1.0
         if span < 0.0:
             stats[0] = t

@@ -106,7 +106,7 @@ def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
             row = world.planes[which[s]]
             body = world.plane_names[which[s]]
             point = centers[s] - radius * row[:3]
-            kind: Kind = "support" if which[s] == 0 else "known"
+            kind: Kind = "support" if body == "support surface" else "known"
             keep(_contact(kind, robot.link_names[link], body, margin - plane[s], s, point, row[:3]))
         if not field[s] > margin:
             body, normal = nearest_source(checker, centers[s])

@@ -145,7 +145,14 @@ def pack_robot(arrays: KinematicArrays, self_margin: float = 0.0) -> PackedRobot
         bounding[link, :3] = turned[int(frame)].T @ arrays.link_center[link]
     bounding[:, 3] = arrays.link_radius
     limits = np.column_stack([arrays.lower, arrays.upper])
-    float_parts = [frames, spheres, bounding, limits, reach_table(arrays), np.array([self_margin])]
+    float_parts = [
+        frames,
+        spheres.T,
+        bounding,
+        limits,
+        reach_table(arrays),
+        np.array([self_margin]),
+    ]
     frame_ints = np.column_stack([arrays.parent, arrays.kind, np.maximum(arrays.q_index, 0)])
     starts, ends = arrays.link_start[:-1], arrays.link_start[1:]
     link_ints = np.column_stack([arrays.link_frame, starts, ends, arrays.link_fixed.astype(int)])

@@ -3,18 +3,18 @@
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
 
 from vprism_plan._kernels import checking as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.collision import _explain
 from vprism_plan.collision._packing import pack_robot, pack_world
 from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.protocols import BakedWorld, SphereRobot
+from vprism_plan.collision.protocols import BakedWorld, Numbers, SphereRobot
 from vprism_plan.collision.reports import MotionReport, StateReport
 from vprism_plan.errors import RobotError
 
 _BATCH_CHUNK = 512
+_ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 
 
 def interpolate(
@@ -60,7 +60,7 @@ class CollisionChecker:
         self._D, self._wf = baked.distance, baked.floats
         self._dof = robot.dof
 
-    def is_valid(self, q: ArrayLike) -> bool:
+    def is_valid(self, q: Numbers) -> bool:
         """Return whether a configuration is free.
 
         Args:
@@ -81,7 +81,7 @@ class CollisionChecker:
         """
         return kernels.is_valid(q, self._rf, self._ri, self._D, self._wf)
 
-    def is_valid_batch(self, Q: ArrayLike) -> Bool[np.ndarray, "n"]:
+    def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
         """Return `is_valid` for each row of Q (n, dof); runs on all worker threads."""
         Q = self._configurations(Q)
         out = np.empty(len(Q), dtype=np.bool_)
@@ -92,7 +92,7 @@ class CollisionChecker:
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return out
 
-    def clearance(self, q: ArrayLike) -> float:
+    def clearance(self, q: Numbers) -> float:
         """Return a lower bound of the distance from the robot to the world, metres.
 
         Negative when a sphere reaches into the level set, the table, known geometry or
@@ -104,15 +104,15 @@ class CollisionChecker:
         """
         return float(self.clearance_batch(self._configuration(q)[None])[0])
 
-    def clearance_batch(self, Q: ArrayLike) -> Float[np.ndarray, "n"]:
+    def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return `clearance` for each row of Q (n, dof), metres."""
         return self._clearances(Q)[0]
 
-    def self_clearance_batch(self, Q: ArrayLike) -> Float[np.ndarray, "n"]:
+    def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
         return self._clearances(Q)[1]
 
-    def check_motion(self, qa: ArrayLike, qb: ArrayLike) -> bool:
+    def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
         """Return whether the straight edge from qa to qb is free, ends included.
 
         The edge is straight in joint space; continuous joints go the short way round.
@@ -132,7 +132,7 @@ class CollisionChecker:
         """`check_motion` for contiguous float64 (dof,) arrays, without looking at shapes."""
         return self._check_motion(qa, qb, np.empty(4))
 
-    def check_motion_report(self, qa: ArrayLike, qb: ArrayLike) -> MotionReport:
+    def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
         """Return the verdict on an edge with its tolerance and, when refused, the reason."""
         qa, qb = self._configuration(qa), self._configuration(qb)
         stats = np.empty(4)
@@ -143,7 +143,7 @@ class CollisionChecker:
             state = self.explain(interpolate(self.robot, qa, qb, fraction))
         return MotionReport(
             valid=valid,
-            certified=valid and bool(stats[2] <= 0.0),
+            certified=valid and bool(stats[2] <= _ROUNDING),
             tolerance=0.5 * float(stats[2]),
             collision_fraction=fraction,
             configurations=int(stats[1]),
@@ -151,7 +151,7 @@ class CollisionChecker:
             state=state,
         )
 
-    def explain(self, q: ArrayLike) -> StateReport:
+    def explain(self, q: Numbers) -> StateReport:
         """Return the verdict on a configuration with every reason that refuses it.
 
         Raises:
@@ -169,12 +169,12 @@ class CollisionChecker:
             `world.planes`; lower bound of the distance to the baked obstacles. Metres.
         """
         n = int(self._ri[1])
-        centers, plane, field = np.empty((n, 3)), np.empty(n), np.empty(n)
+        centers, plane, field = np.empty((3, n)), np.empty(n), np.empty(n)
         which = np.empty(n, dtype=np.int64)
         kernels.sphere_clearances(
             q, self._rf, self._ri, self._D, self._wf, centers, plane, which, field
         )
-        return centers, plane, which, field
+        return np.ascontiguousarray(centers.T), plane, which, field
 
     def pair_gaps(self, q: Float[np.ndarray, "dof"]) -> tuple[np.ndarray, np.ndarray]:
         """Return the gap of each of `robot.collision_pairs`, metres, and the spheres (P, 2)."""
@@ -188,7 +188,7 @@ class CollisionChecker:
             qa, qb, self._rf, self._ri, self._D, self._wf, self.config.min_motion, stats
         )
 
-    def _clearances(self, Q: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def _clearances(self, Q: Numbers) -> tuple[np.ndarray, np.ndarray]:
         Q = self._configurations(Q)
         if not np.isfinite(Q).all():
             row = int(np.flatnonzero(~np.isfinite(Q).all(axis=1))[0])
@@ -205,7 +205,7 @@ class CollisionChecker:
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return world, own
 
-    def _configuration(self, q: ArrayLike) -> Float[np.ndarray, "dof"]:
+    def _configuration(self, q: Numbers) -> Float[np.ndarray, "dof"]:
         array = np.ascontiguousarray(q, dtype=np.float64)
         if array.shape != (self._dof,):
             raise RobotError(
@@ -214,7 +214,7 @@ class CollisionChecker:
             )
         return array
 
-    def _configurations(self, Q: ArrayLike) -> Float[np.ndarray, "n dof"]:
+    def _configurations(self, Q: Numbers) -> Float[np.ndarray, "n dof"]:
         array = np.ascontiguousarray(Q, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != self._dof:
             raise RobotError(

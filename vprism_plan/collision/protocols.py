@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a checker needs of a world and of a robot: anything that has it can be checked."""
 
+from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -8,6 +9,9 @@ from numpy.typing import ArrayLike
 
 from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.robots import KinematicArrays
+
+# Joint values as people write them: an array, a tensor, a list or a tuple.
+Numbers = ArrayLike | Sequence[Any]
 
 
 @runtime_checkable
@@ -127,15 +131,15 @@ class Answers(Protocol):
     robot: SphereRobot
     config: CheckerConfig
 
-    def is_valid(self, q: ArrayLike) -> bool:
+    def is_valid(self, q: Numbers) -> bool:
         """Verdict on a configuration."""
         ...
 
-    def clearance(self, q: ArrayLike) -> float:
+    def clearance(self, q: Numbers) -> float:
         """Distance to the world, metres."""
         ...
 
-    def self_clearance_batch(self, Q: ArrayLike) -> np.ndarray:
+    def self_clearance_batch(self, Q: Numbers) -> np.ndarray:
         """(n,) smallest gaps between links, metres."""
         ...
 

@@ -1,0 +1,248 @@
+"""The command line as a person uses it: answers, exit codes, one clear line for what is wrong."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import vprism_plan as vp
+from vprism_plan.cli import main
+from vprism_plan.evaluation.camera import Camera
+from vprism_plan.evaluation.scenes import Scene, render
+from vprism_plan.evaluation.solids import Box
+
+
+@pytest.fixture(scope="module")
+def view():
+    """A small, clean view of one box."""
+    pose = np.eye(4)
+    pose[2, 3] = 0.05
+    camera = Camera.orbit(np.array([0.0, 0.0, 0.05]), 0.8, 0.3, 0.7)
+    box = Box((0.04, 0.03, 0.05), pose=pose)
+    return render(Scene((box,), (1,), camera), camera)
+
+
+@pytest.fixture(scope="module")
+def saved_map(view, tmp_path_factory):
+    path = tmp_path_factory.mktemp("maps") / "map.safetensors"
+    config = vp.MapConfig(hinge_spacing=0.06, surface_hinges=8, iterations=2)
+    vp.fit_map(view, config).save(path)
+    return path
+
+
+def call(capsys, *arguments):
+    """Exit code, standard output and standard error lines of one call."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    streams = capsys.readouterr()
+    return ended.value.code, streams.out, streams.err.splitlines()
+
+
+def write(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+BROKEN = {
+    "missing file": ("absent.npz", {}, "absent.npz"),
+    "wrong shape": ("a.npz", {"depth": lambda d: d[0]}, "depth"),
+    "labels of another shape": ("b.npz", {"labels": lambda x: x[:-1]}, "labels"),
+    "NaN depth": ("c.npz", {"depth": lambda d: np.where(d > 1.0, np.nan, d)}, "NaN|finite"),
+    "labels without objects": ("d.npz", {"labels": lambda x: 0 * x}, "object"),
+    "singular intrinsics": ("e.npz", {"intrinsics": lambda k: 0 * k}, "intrinsics"),
+    "pose that is not rigid": ("f.npz", {"T_world_camera": lambda t: 2 * t}, "T_world_camera|pose"),
+    "no plane": ("g.npz", {"depth": lambda d: np.where(d > 0, 0 * d, d)}, "plane|depth|return"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_input_is_one_clear_line_and_leaves_nothing_behind(name, view, tmp_path, capsys):
+    file, changes, words = BROKEN[name]
+    arrays = {
+        "depth": view.depth,
+        "labels": view.labels,
+        "intrinsics": view.intrinsics,
+        "T_world_camera": view.T_world_camera,
+    }
+    path = tmp_path / file
+    if changes:
+        for key, change in changes.items():
+            arrays[key] = change(arrays[key])
+        write(path, **arrays)
+    output = tmp_path / "out" / "map.safetensors"
+    code, out, err = call(capsys, "map", path, "--output", output)
+    assert code == 2
+    assert out == ""
+    assert len(err) == 1, err
+    import re
+
+    assert re.search(words, err[0]), err[0]
+    assert not list(tmp_path.glob("out/*"))
+
+
+def test_scattered_points_without_labels_have_no_plane(view, tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 2.0, view.depth.shape)
+    path = write(tmp_path / "noise.npz", depth=depth, intrinsics=view.intrinsics)
+    code, _, err = call(capsys, "map", path, "--output", tmp_path / "map.safetensors")
+    assert code == 2
+    assert len(err) == 1
+    assert "plane" in err[0]
+    assert not (tmp_path / "map.safetensors").exists()
+
+
+def test_a_failed_write_keeps_the_old_map(saved_map, tmp_path, capsys):
+    old = tmp_path / "map.safetensors"
+    old.write_bytes(b"old")
+    code, *_ = call(capsys, "map", tmp_path / "absent.npz", "--output", old)
+    assert code == 2
+    assert old.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["map.safetensors"]
+
+
+def test_map_writes_what_load_map_reads(view, tmp_path, capsys):
+    path = write(
+        tmp_path / "view.npz",
+        depth=view.depth,
+        labels=view.labels,
+        intrinsics=view.intrinsics,
+        T_world_camera=view.T_world_camera,
+    )
+    output = tmp_path / "map.safetensors"
+    code, out, _ = call(capsys, "map", path, "--output", output, "--json")
+    assert code == 0
+    report = json.loads(out)
+    assert report["objects"] == [1]
+    assert vp.load_map(output).object_ids == (1,)
+
+
+def planar(repository):
+    return repository / "urdf" / "planar3.urdf"
+
+
+def test_query_answers_with_reasons_and_codes(saved_map, repository, capsys):
+    far = ("--base-xyz", "0", "0", "0.6")
+    code, out, _ = call(
+        capsys, "query", saved_map, "--robot", planar(repository), "--q", 0, 0, 0, *far
+    )
+    assert code == 0
+    assert out.startswith("free")
+    # The arm's plane cuts the box, and the box stands within its reach.
+    near = ("--base-xyz", "-0.4", "0", "-0.1")
+    code, out, _ = call(
+        capsys, "query", saved_map, "--robot", planar(repository), "--q", 0, 0, 0, *near, "--json"
+    )
+    assert code == 1
+    report = json.loads(out)
+    assert report["valid"] is False
+    assert any(c["contact_body_2"] == "object:1" for c in report["contacts"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--q", "0", "0"], "joint|shape"),
+        (["--q", "0", "0", "0", "--margin", "-1"], "margin"),
+    ],
+)
+def test_a_bad_question_is_bad_input(arguments, words, saved_map, repository, capsys):
+    import re
+
+    code, _, err = call(capsys, "query", saved_map, "--robot", planar(repository), *arguments)
+    assert code == 2
+    assert len(err) == 1
+    assert re.search(words, err[0])
+
+
+def test_an_unknown_robot_file_is_bad_input(saved_map, tmp_path, capsys):
+    code, _, err = call(
+        capsys, "query", saved_map, "--robot", tmp_path / "none.urdf", "--q", "0", "0"
+    )
+    assert code == 2
+    assert "none.urdf" in err[0]
+
+
+def test_unknown_arguments_are_bad_input(capsys):
+    code, *_ = call(capsys, "map", "--no-such-flag")
+    assert code == 2
+
+
+def test_an_unknown_policy_is_bad_input_and_the_valid_ones_are_listed(
+    saved_map, repository, capsys
+):
+    policy = ("--occluded", "maybe")
+    code, _, err = call(
+        capsys, "query", saved_map, "--robot", planar(repository), "--q", 0, 0, 0, *policy
+    )
+    assert code == 2
+    assert "posterior" in " ".join(err)
+
+
+def test_mesh_writes_watertight_objects(saved_map, tmp_path, capsys):
+    import trimesh
+
+    code, out, _ = call(capsys, "mesh", saved_map, "--output", tmp_path / "meshes", "--json")
+    assert code == 0
+    mesh = trimesh.load_mesh(json.loads(out)["1"]["file"])
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+
+
+def test_plan_reports_an_invalid_goal_with_its_reason(saved_map, repository, tmp_path, capsys):
+    free, blocked = ("1.2", "0", "0"), ("0", "0", "0")
+    code, out, _ = call(
+        capsys,
+        *("plan", saved_map, "--robot", planar(repository), "--output", tmp_path / "out"),
+        *("--base-xyz", "-0.4", "0", "-0.1", "--start", *free, "--goal", *blocked),
+    )
+    assert code == 1
+    assert "invalid_goal" in out
+    assert "object:1" in out
+    assert not (tmp_path / "out" / "trajectory.json").exists()
+
+
+def test_plan_writes_a_trajectory_that_reads_back(saved_map, repository, tmp_path, capsys):
+    from vprism_plan.planning import read_trajectory
+
+    output = tmp_path / "out"
+    code, out, _ = call(
+        capsys,
+        *("plan", saved_map, "--robot", planar(repository), "--output", output, "--json"),
+        *(
+            "--base-xyz",
+            "-0.4",
+            "0",
+            "-0.1",
+            "--start",
+            "1.2",
+            "0",
+            "0",
+            "--goal",
+            "-1.2",
+            "0",
+            "0",
+        ),
+    )
+    report = json.loads(out)
+    assert code == (0 if report["plan"]["status"] == "exact" else 1)
+    assert report["plan"]["status"] == "exact", report["plan"]["message"]
+    names, trajectory = read_trajectory(output / "trajectory.json")[:2]
+    assert tuple(names) == tuple(report["joint_names"])
+    assert trajectory.positions.shape[1] == 3
+    assert {p.name for p in output.iterdir()} >= {"plan.png", "map.png", "scene.png", "report.json"}
+
+
+def test_help_answers_at_once():
+    durations = []
+    for _ in range(3):
+        start = time.perf_counter()
+        command = [sys.executable, "-m", "vprism_plan.cli", "--help"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        durations.append(time.perf_counter() - start)
+    assert "demo" in done.stdout
+    heavy = "import sys, vprism_plan.cli; print([m for m in ('torch','numba','ompl') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
