@@ -6,6 +6,7 @@ from oracles.world_oracles import KernelMap, level_points, random_map
 from vprism_plan.evaluation.scenes import hidden_object_scene
 from vprism_plan.mapping import MapConfig, fit_map
 from vprism_plan.perception import Plane
+from vprism_plan.world import World, WorldConfig
 
 
 @pytest.fixture(scope="session")
@@ -59,3 +60,20 @@ def occupied(any_map) -> np.ndarray:
     points = level_points(any_map, spacing, 0.5, np.array([0.21, 0.43, 0.67]))
     assert len(points) > 500
     return points
+
+
+def around(map_) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds that hold the map's support and little else: small grids bake fast."""
+    lower, upper = map_.support_bounds()
+    return lower - 0.05, upper + 0.05
+
+
+@pytest.fixture(scope="session")
+def world(any_map) -> World:
+    return World(any_map, WorldConfig(bounds=around(any_map)))
+
+
+@pytest.fixture(scope="session")
+def objects_only(any_map) -> World:
+    free = WorldConfig(bounds=around(any_map), occluded="free", unobserved="free")
+    return World(any_map, free)

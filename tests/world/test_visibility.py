@@ -219,6 +219,21 @@ def test_space_under_the_table_is_left_to_the_half_space(hidden_scene):
     assert (below @ world.planes[0, :3] - world.planes[0, 3] < 0).all()
 
 
+def test_seen_table_casts_no_shadow_on_itself(hidden_scene):
+    """Seen at a glance and with noise, yet the space right above it is free."""
+    config = WorldConfig(bounds=((-0.6, -0.6, -0.05), (0.6, 0.6, 0.3)))
+    world = World(_empty_map(hidden_scene.observation), config)
+    points = np.random.default_rng(0).uniform((-0.6, -0.6, 0.0), (0.6, 0.6, 0.03), (20000, 3))
+    seen = world.status(points) == SEEN
+    away = hidden_scene.signed_distance(points) > 0.1
+    heights = points[seen & away, 2]
+    assert len(heights) > 2000
+    free = world.field.lower_bound(points[seen & away]) > 0.0
+    assert free.mean() > 0.9
+    below = points * (1, 1, -1)
+    assert (world.status(below) == OCCLUDED).all()
+
+
 def test_status_outside_the_grid(hidden_scene):
     world = World(_empty_map(hidden_scene.observation), WorldConfig(occluded="free"))
     assert world.status(np.array([[50.0, 0.0, 0.0]]))[0] == OUTSIDE

@@ -117,8 +117,7 @@ def test_half_spaces_are_planes_after_the_support_surface():
     assert World(random_map(1)).planes.shape == (0, 4)
 
 
-def test_interface_holds_for_every_map(any_map):
-    world = World(any_map)
+def test_interface_holds_for_every_map(any_map, world, objects_only):
     field = world.field
     names = [f"object:{i}" for i in any_map.object_ids]
     assert world.sources == (*names, "background", "occluded", "unobserved")
@@ -131,15 +130,14 @@ def test_interface_holds_for_every_map(any_map):
     lower, upper = any_map.support_bounds()
     inside = np.array([lower, upper])
     points = np.random.default_rng(0).uniform(*inside, (5000, 3))
-    again = World(any_map)
+    again = World(any_map, world.config)
     assert np.array_equal(again.field.distance, field.distance)
     assert np.array_equal(again.field.source, field.source)
     occupied = any_map.occupancy(points) >= 0.5
     assert (field.lower_bound(points[occupied]) <= 0.0).all()
     # Level sets shrink with the level, and so the distance grows.
-    bounds = (field.origin, field.upper)
-    strict = World(any_map, WorldConfig(level=0.9, bounds=bounds, **FREE)).field
-    plain = World(any_map, WorldConfig(bounds=bounds, **FREE)).field
+    strict = World(any_map, WorldConfig(level=0.9, bounds=world.config.bounds, **FREE)).field
+    plain = objects_only.field
     assert (strict.lower_bound(points) >= plain.lower_bound(points) - 0.005).mean() > 0.99
     occupancy, entropy, nodes = world.occupancy_slice(0.05)
     assert occupancy.shape == entropy.shape == nodes.shape[:2] == field.distance.shape[:2]

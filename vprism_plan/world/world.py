@@ -72,10 +72,10 @@ class World:
             raise WorldError(
                 f"the map has {len(map.object_ids)} objects; a world holds at most {_MAX_OBJECTS}"
             )
-        objects = [f"object:{i}" for i in map.object_ids]
+        names = [f"object:{i}" for i in map.object_ids]
         solids = [k for k in self.config.known if not isinstance(k, HalfSpace)]
         self.sources: tuple[str, ...] = (
-            *objects,
+            *names,
             "background",
             "occluded",
             "unobserved",
@@ -90,15 +90,17 @@ class World:
             map, self.config, None if box is None else (box[0] * fine, box[1] * fine)
         )
         self._views = [
-            visibility.make_view(view, self.config.occlusion_tolerance) for view in map.views
+            visibility.make_view(view, self.config.occlusion_tolerance, map.plane)
+            for view in map.views
         ]
         self._unseen = self._timed("visibility", self._mark_unseen)
         known = self._timed("known geometry", self._known_distances, solids)
         self._known: NodeDistances = combine(known, self.grid)
         others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
-        everything = [self._timed("distance to objects", self._object_distances, None)]
-        self._others = combine([others, self._known], self.grid)
-        self.field: DistanceField = self._timed("combine", self._field, everything, self._others)
+        objects = self._timed("distance to objects", self._object_distances, None)
+        self.field: DistanceField = self._timed(
+            "combine", self._field, [objects, others, self._known]
+        )
         self._cache: dict[tuple[str, frozenset[int]], DistanceField] = {}
         _log.debug("world baked: %s nodes, %s", self.field.distance.size, self.timings)
 
@@ -206,8 +208,8 @@ class World:
             parts.append(NodeDistances(distance, source))
         return parts
 
-    def _field(self, objects: list[NodeDistances], others: NodeDistances) -> DistanceField:
-        nodes = combine([*objects, others], self.grid)
+    def _field(self, parts: list[NodeDistances]) -> DistanceField:
+        nodes = combine(parts, self.grid)
         return finish(nodes, self.grid, self.sources, self.config.unobserved == "occupied")
 
     # --- queries ---------------------------------------------------------------
@@ -244,8 +246,7 @@ class World:
             rest = set(range(1, len(self.map.object_ids) + 1)) - gone
             kept = self._object_distances(rest)
             unseen = self._unseen_distances(self._unseen_outside(gone))
-            others = combine([unseen, self._known], self.grid)
-            self._cache[key] = self._field([kept], others)
+            self._cache[key] = self._field([kept, unseen, self._known])
         return self._cache[key]
 
     def _classes(self, object_ids: Collection[int]) -> list[int]:
@@ -277,14 +278,17 @@ class World:
     def status(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """What the cameras know of each world point, whatever the policies say.
 
-        0: some view saw past it or up to it. 1 (occluded): behind what a view saw. 2
-        (unobserved): outside every image, or no depth return. 3: outside the grid.
+        0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or
+        under the support surface. 2 (unobserved): outside every image, or no depth
+        return. 3: outside the grid.
 
         Raises:
             WorldError: a point is not finite.
         """
         points = checked_points(points)
         status = visibility.classify_points(self._views, points)
+        if self.map.plane is not None:
+            status[self.map.plane.signed_distance(points) < 0.0] = visibility.OCCLUDED
         outside = ((points < self.grid.origin) | (points > self.grid.upper)).any(axis=1)
         status[outside] = visibility.OUTSIDE
         return status
