@@ -15,7 +15,7 @@ from vprism_plan.errors import RobotError
 from vprism_plan.robots._geometry import PrimitiveGeometry
 from vprism_plan.robots._model import RobotModel
 
-# Cells of at most this edge keep the tiles' protrusion under 2.2 cm.
+# Pieces of about this size protrude by about half of it.
 _TILE_EDGE = 0.06
 _MAX_TILES = 64
 
@@ -134,9 +134,10 @@ def _from_geometry(model: RobotModel) -> LinkSpheres:
 def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
     """Spheres whose union holds a solid.
 
-    The solid is cut into box cells (cylinders: into the cells of their bounding
-    box that reach the disc); each cell gets the ball through its corners, which
-    holds the cell, so the union holds the solid.
+    A box is cut into box cells, a cylinder into slices of rings of sectors; each
+    piece gets a ball through its corners. Over a piece the distance to the ball's
+    centre is largest at a corner, so each ball holds its piece and the union holds
+    the solid.
 
     Args:
         solid: A box, cylinder or sphere.
@@ -146,43 +147,58 @@ def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
     """
     if solid.kind == "sphere":
         return np.array([[*solid.T_link[:3, 3], solid.size[0]]])
-    if solid.kind == "cylinder" and solid.size[0] <= _TILE_EDGE:
-        local = _slender_cylinder(*solid.size)
-    else:
-        radius = solid.size[0]
-        edges = solid.size if solid.kind == "box" else (2 * radius, 2 * radius, solid.size[1])
-        local = _tile_box(np.asarray(edges))
-        if solid.kind == "cylinder":
-            half = 0.5 * np.asarray(edges[:2]) / _cell_counts(np.asarray(edges))[:2]
-            nearest = np.maximum(np.abs(local[:, :2]) - half, 0.0)
-            local = local[np.linalg.norm(nearest, axis=1) <= radius]
+    local = _tile_cylinder(*solid.size) if solid.kind == "cylinder" else _tile_box(solid.size)
     local[:, :3] = local[:, :3] @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
     # Rounding in the transform must not open a gap at the corners.
     local[:, 3] *= 1.0 + 1e-9
     return local
 
 
-def _slender_cylinder(radius: float, length: float) -> Float[np.ndarray, "n 4"]:
-    """One row of spheres along the axis; each holds its slice of the cylinder."""
-    n = min(_MAX_TILES, max(1, math.ceil(length / max(radius, 0.5 * _TILE_EDGE))))
-    step = length / n
-    rows = np.zeros((n, 4))
-    rows[:, 2] = (np.arange(n) + 0.5) * step - 0.5 * length
-    rows[:, 3] = math.hypot(radius, 0.5 * step)
-    return rows
+def _tile_cylinder(radius: float, length: float) -> Float[np.ndarray, "n 4"]:
+    """A ball on the axis and rings of balls around it, repeated along the axis."""
+    edge = _TILE_EDGE
+    while True:
+        rings = math.ceil(radius / edge)
+        # A slender cylinder gains nothing from slices much thinner than it is wide.
+        slices = math.ceil(length / max(0.5 * edge, min(edge, radius)))
+        disc = _tile_disc(radius, rings, edge)
+        if len(disc) * slices <= _MAX_TILES or len(disc) == slices == 1:
+            break
+        edge *= 1.1
+    step = length / slices
+    heights = (np.arange(slices) + 0.5) * step - 0.5 * length
+    rows = np.empty((slices, len(disc), 4))
+    rows[..., :2] = disc[:, :2]
+    rows[..., 2] = heights[:, None]
+    rows[..., 3] = np.hypot(disc[:, 2], 0.5 * step)
+    return rows.reshape(-1, 4)
 
 
-def _cell_counts(edges: Float[np.ndarray, "3"]) -> np.ndarray:
+def _tile_disc(radius: float, rings: int, edge: float) -> Float[np.ndarray, "n 3"]:
+    """Circles (x, y, radius) whose union holds a disc."""
+    width = radius / rings
+    circles = [np.array([[0.0, 0.0, width]])]
+    for ring in range(1, rings):
+        inner, outer = ring * width, (ring + 1) * width
+        n = max(4, math.ceil(2 * math.pi * outer / edge))
+        half = math.pi / n
+        # Equally far from the sector's inner and outer corners.
+        middle = (inner + outer) / (2 * math.cos(half))
+        reach = math.hypot(outer * math.cos(half) - middle, outer * math.sin(half))
+        turn = 2 * math.pi * np.arange(n) / n
+        circles.append(
+            np.column_stack([middle * np.cos(turn), middle * np.sin(turn), np.full(n, reach)])
+        )
+    return np.vstack(circles)
+
+
+def _tile_box(size: Sequence[float]) -> Float[np.ndarray, "n 4"]:
+    edges = np.asarray(size)
     edge = min(_TILE_EDGE, float(edges.min()))
     counts = np.ceil(edges / edge).astype(int)
     while counts.prod() > _MAX_TILES:
         edge *= 1.1
         counts = np.ceil(edges / edge).astype(int)
-    return counts
-
-
-def _tile_box(edges: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n 4"]:
-    counts = _cell_counts(edges)
     cell = edges / counts
     axes = [(np.arange(n) + 0.5) * c - 0.5 * e for n, c, e in zip(counts, cell, edges, strict=True)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

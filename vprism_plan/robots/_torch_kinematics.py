@@ -80,7 +80,7 @@ def _build_chain(arrays: KinematicArrays, dtype: torch.dtype, device: torch.devi
     from pytorch_kinematics.frame import Link as ChainLink
     from pytorch_kinematics.transforms import Transform3d
 
-    nodes = []
+    nodes: list[Frame] = []
     for f in range(len(arrays.parent)):
         node = Frame(f"f{f}", link=ChainLink(f"f{f}"))
         if f > 0:

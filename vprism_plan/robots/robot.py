@@ -19,7 +19,8 @@ from vprism_plan.errors import RobotError
 from vprism_plan.robots import _frames, _self_collision
 from vprism_plan.robots._arrays import KinematicArrays
 from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._model import RobotModel, load_model
+from vprism_plan.robots._model import load_model
+from vprism_plan.robots._setup import choose_joints, lock_values, rigid_pose
 from vprism_plan.robots._spheres import link_spheres
 from vprism_plan.robots._srdf import SemanticModel, load_srdf
 from vprism_plan.robots._torch_kinematics import TorchKinematics
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     import torch
 
 READY = "ready"
-ARM_GROUP = "arm"
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +102,9 @@ class Robot:
         beside = path.with_suffix(".srdf")
         srdf = beside if srdf is None and beside.is_file() else srdf
         semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
-        active = _choose_joints(model, semantics, joints)
-        fixed_values = _lock(model, semantics, active, locked or {})
-        base = _rigid(np.eye(4) if base_pose is None else base_pose)
+        active = choose_joints(model, semantics, joints)
+        fixed_values = lock_values(model, semantics, active, locked or {})
+        base = rigid_pose(np.eye(4) if base_pose is None else base_pose)
         balls = link_spheres(model, path, spheres)
         nothing = np.empty((0, 2), dtype=np.int64)
         arrays, links = _frames.build_arrays(model, active, fixed_values, balls, nothing, base)
@@ -269,7 +269,7 @@ class Robot:
         Raises:
             RobotError: The pose is not a rigid motion.
         """
-        base = _rigid(base_pose)
+        base = rigid_pose(base_pose)
         arrays = dataclasses.replace(
             self.arrays,
             base_R=np.ascontiguousarray(base[:3, :3]),
@@ -279,76 +279,3 @@ class Robot:
 
     def _expected(self, opening: str) -> str:
         return f"{opening}{self.dof},) for the joints {list(self.joint_names)}"
-
-
-def _choose_joints(
-    model: RobotModel, semantics: SemanticModel, joints: Sequence[str] | None
-) -> tuple[str, ...]:
-    valid = model.actuated
-    if joints is None:
-        group = [name for name in semantics.groups.get(ARM_GROUP, ()) if name in valid]
-        chosen = tuple(group) or valid
-    elif isinstance(joints, str):
-        raise RobotError(f"joints is the string {joints!r}; give a sequence of joint names")
-    else:
-        chosen = tuple(joints)
-    unknown = [name for name in chosen if name not in valid]
-    if unknown:
-        raise RobotError(f"unknown or non-actuated joints {unknown}; valid: {list(valid)}")
-    if len(set(chosen)) != len(chosen):
-        raise RobotError(f"joints {list(chosen)} names a joint twice")
-    if not chosen:
-        raise RobotError(f"no joint of '{model.name}' moves; a robot needs at least one")
-    return chosen
-
-
-def _lock(
-    model: RobotModel,
-    semantics: SemanticModel,
-    active: Sequence[str],
-    given: Mapping[str, float],
-) -> dict[str, float]:
-    """The value of every actuated joint that is not in the configuration."""
-    rest = [name for name in model.actuated if name not in active]
-    unknown = sorted(set(given) - set(rest))
-    if unknown:
-        raise RobotError(f"locked names {unknown}; joints that can be locked here: {rest}")
-    values = {}
-    for name in rest:
-        joint = model.joint_map[name]
-        stated = semantics.state_value(name)
-        if name in given:
-            value = float(given[name])
-        elif stated is not None:
-            value = stated
-        else:
-            value = min(max(0.0, joint.lower), joint.upper)
-        within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
-        if not (math.isfinite(value) and within):
-            raise RobotError(
-                f"joint '{name}' is locked at {value}; its limits are "
-                f"[{joint.lower:.6g}, {joint.upper:.6g}]"
-            )
-        values[name] = value
-    return values
-
-
-def _rigid(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
-    """A copy of a pose, refused unless it is a proper rigid motion."""
-    try:
-        T = np.array(pose, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RobotError(f"base_pose is not a (4, 4) array: {error}") from error
-    if T.shape != (4, 4):
-        raise RobotError(f"base_pose has shape {T.shape}; expected (4, 4)")
-    if not np.isfinite(T).all():
-        raise RobotError("base_pose holds NaN or infinite values; give a rigid 4x4 pose")
-    R = T[:3, :3]
-    drift = float(np.abs(R @ R.T - np.eye(3)).max())
-    if drift > 1e-6 or np.linalg.det(R) < 0 or not np.array_equal(T[3], [0, 0, 0, 1]):
-        raise RobotError(
-            f"base_pose is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
-            f"determinant {np.linalg.det(R):.6g} (expected 1) and last row {T[3].tolist()} "
-            "(expected [0, 0, 0, 1])"
-        )
-    return T
