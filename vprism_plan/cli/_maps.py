@@ -79,6 +79,7 @@ def run_map(command: Map, console: Console) -> int:
     payload = {
         "output": command.output,
         "bytes": size,
+        "objects": list(m.object_ids),
         "map": describe_map(m),
         "segmented": "segment" in console.timings,
         "aligned": "align" in console.timings,
@@ -105,7 +106,7 @@ def write_meshes(m: "VPrismMap", folder: Path, level: float, resolution: float) 
     meshes = extract_meshes(m, level=level, resolution=resolution)
     folder.mkdir(parents=True, exist_ok=True)
     for object_id, mesh in meshes.items():
-        (folder / f"object_{object_id}.ply").write_bytes(mesh.export(file_type="ply"))
+        mesh.export(folder / f"object_{object_id}.ply")
     return meshes
 
 

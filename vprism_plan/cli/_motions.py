@@ -55,8 +55,12 @@ def run_plan(command: Plan, console: Console) -> int:
             situation = _place(command, robot, world)
     except NoPlaceError as error:
         console.finish(
-            {"status": "no_place", "message": str(error), "timings": console.timings},
-            [f"no safe answer: {error}"],
+            {
+                "solved": False,
+                "plan": {"status": "no_place", "message": str(error)},
+                "timings": console.timings,
+            },
+            [f"no safe answer (no_place): {error}"],
         )
         return 1
     return solve(

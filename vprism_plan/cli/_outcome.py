@@ -70,9 +70,7 @@ def _payload(
     robot, world = checker.robot, checker.world
     explanation = result.explanation
     return {
-        "status": result.status,
         "solved": result.solved,
-        "message": result.message,
         "robot": robot.name,
         "joint_names": list(robot.joint_names),
         "base_pose": robot.base_pose,
@@ -80,7 +78,7 @@ def _payload(
         "goal": situation.goal,
         "chosen_automatically": list(situation.chosen),
         "path": result.path,
-        "plan": asdict(result.report),
+        "plan": {"status": result.status, "message": result.message, **asdict(result.report)},
         "explanation": None if explanation is None else explanation.text(),
         "map": describe_map(world.map),
         "world": {
@@ -183,7 +181,6 @@ def _draw(situation: Situation, result: "PlanResult", meshes: dict[int, Any], as
         checker.robot,
         path,
         table_height=float(m.plane.offset / m.plane.normal[2]),
-        camera_center=view.camera_center,
         title=title,
     )
     save_figure(figure, aside / "plan.png")
@@ -228,6 +225,6 @@ def _lines(
             )
         lines.append(f"trajectory: {payload['trajectory']['duration']:.1f} s")
     else:
-        lines.append(f"no safe answer: {result.message}")
+        lines.append(f"no safe answer ({result.status}): {result.message}")
     lines += [time_line(console), f"wrote {output}/: {', '.join(written)}"]
     return lines

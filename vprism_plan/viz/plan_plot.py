@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The plan as a picture: objects, the robot from start to goal, the path of the hand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from vprism_plan.viz._figures import new_figure, object_color
-from vprism_plan.viz._painter import Painter, View, sheet, unit_sphere
+from vprism_plan.viz._raster import Film, Layer, View, ground, halved
 
 if TYPE_CHECKING:
     import trimesh
@@ -22,7 +22,31 @@ if TYPE_CHECKING:
 START_COLOR = (0.16, 0.44, 0.70)
 GOAL_COLOR = (0.85, 0.45, 0.13)
 _HAND_COLOR = (0.72, 0.05, 0.35)
-_TABLE_COLOR = (0.86, 0.85, 0.82)
+_BASE_COLOR = (0.66, 0.66, 0.68)
+_PIXELS = 1280  # along the longer side of a view, before averaging
+_CLEAR = 0.16  # how much of a pose in between is seen
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """Everything that is drawn, in world coordinates."""
+
+    meshes: "Mapping[int, trimesh.Trimesh]"
+    centers: np.ndarray  # (t, s, 3) spheres along the path
+    radii: np.ndarray
+    fixed: np.ndarray  # (s,) spheres that no joint moves
+    hand: np.ndarray  # (t, 3)
+    table: float
+    ghosts: np.ndarray  # rows of `centers` drawn clear
+
+    def points(self) -> np.ndarray:
+        """Return points that must be in the picture, and their shadows on the table."""
+        shown = self.centers[[0, *self.ghosts, -1]].reshape(-1, 3)
+        vertices = [np.asarray(mesh.vertices) for mesh in self.meshes.values()]
+        points = np.concatenate([shown, *vertices])
+        shadow = points.copy()
+        shadow[:, 2] = self.table
+        return np.concatenate([points, shadow])
 
 
 def plan_figure(
@@ -31,8 +55,7 @@ def plan_figure(
     path: Float[np.ndarray, "t dof"],
     *,
     table_height: float = 0.0,
-    camera_center: Float[np.ndarray, "3"] | None = None,
-    ghosts: int = 4,
+    ghosts: int = 3,
     title: str | None = None,
 ) -> Figure:
     """Draw the map's objects and the robot's collision spheres along a path, from two views.
@@ -42,40 +65,121 @@ def plan_figure(
         robot: supplies the spheres; its base must stand where it was planned.
         path: waypoints in joint space; drawn at equal joint-space arc length.
         table_height: z of the table top, metres.
-        camera_center: the camera that saw the scene, drawn as a marker if given.
         ghosts: how many poses between start and goal are drawn, clear.
         title: above both views.
     """
-    dense = resample(path, 60)
-    centers = sphere_centers(robot, dense)
-    middle, size = _extent(meshes, centers)
-    painter = _compose(meshes, robot, centers, dense, ghosts)
-    table = _table(middle, size, table_height)
-    figure = new_figure(13.2, 6.4)
-    axes = figure.subplots(1, 2)
+    dense = resample(path, 120)
+    stage = _Stage(
+        meshes,
+        sphere_centers(robot, dense),
+        np.asarray(robot.sphere_radii),
+        np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)],
+        hand_path(robot, dense),
+        table_height,
+        np.linspace(0, len(dense) - 1, ghosts + 2).astype(int)[1:-1],
+    )
+    views = _views(stage, robot)
+    pictures = [_render(stage, view) for _, view in views]
+    shapes = [picture.shape[1] / picture.shape[0] for picture in pictures]
+    figure = new_figure(max(5.6 * sum(shapes) + 0.4, 8.0), 6.6)
     if title:
         figure.suptitle(title)
-    base = robot.base_pose[:3, 3]
-    sideways = middle[:2] - base[:2]
-    sideways /= max(float(np.linalg.norm(sideways)), 1e-9)
-    heading = float(np.arctan2(sideways[1], sideways[0]))
-    for axis, (name, turn, height) in zip(
-        axes,
-        (("facing the robot", 0.45, 0.45), ("from above, behind the robot", 2.75, 0.85)),
-        strict=True,
-    ):
-        angle = heading + turn
-        offset = np.array(
-            [np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)]
-        )
-        view = View(middle + 2.6 * size * offset, middle)
-        table.paint(axis, view)
-        painter.paint(axis, view)
-        _fit(axis, view, meshes, centers, table_height)
-        _mark(axis, view, camera_center)
+    axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": shapes})
+    for axis, (name, _), picture in zip(axes, views, pictures, strict=True):
+        axis.imshow(picture, interpolation="antialiased")
         axis.set_title(name, fontsize=11)
+        axis.set_axis_off()
     _legend(figure, meshes)
     return figure
+
+
+def _views(stage: _Stage, robot: "Robot") -> list[tuple[str, View]]:
+    points = stage.points()
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = 0.5 * (low + high)
+    middle[2] = stage.table + 0.45 * (high[2] - stage.table)
+    distance = 2.2 * float(np.linalg.norm(high - low)) / 2
+    ahead = middle[:2] - robot.base_pose[:2, 3]
+    heading = float(np.arctan2(ahead[1], ahead[0]))
+    views = []
+    for name, turn, height in (("facing the robot", 0.30, 0.42), ("from above", 0.0, 1.15)):
+        angle = heading + turn
+        offset = [np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)]
+        views.append((name, View(middle + distance * np.array(offset), middle)))
+    return views
+
+
+def _render(stage: _Stage, view: View) -> np.ndarray:
+    """Return one view as an image (h, w, 3) in 0..1."""
+    flat = view.project(stage.points())
+    pad = 0.07 * float((flat.max(axis=0) - flat.min(axis=0)).max())
+    low, high = flat.min(axis=0) - pad, flat.max(axis=0) + pad
+    film = Film(view, low, high, _PIXELS / float((high - low).max()))
+    solid = Layer(film)
+    for object_id, mesh in stage.meshes.items():
+        solid.add_mesh(*_corners(mesh), object_color(object_id))
+    start, goal, fixed = stage.centers[0], stage.centers[-1], stage.fixed
+    solid.add_spheres(start[fixed], stage.radii[fixed], _BASE_COLOR)
+    solid.add_spheres(start[~fixed], stage.radii[~fixed], START_COLOR)
+    solid.add_spheres(goal[~fixed], stage.radii[~fixed], GOAL_COLOR)
+    picture, table = ground(film, stage.table, *_shade(stage))
+    seen = solid.depth < table
+    picture[seen] = solid.shaded()[seen]
+    behind = np.minimum(table, solid.depth)
+    for row in stage.ghosts:
+        share = row / (len(stage.centers) - 1)
+        color = (1 - share) * np.array(START_COLOR) + share * np.array(GOAL_COLOR)
+        ghost = Layer(film)
+        ghost.add_spheres(stage.centers[row][~fixed], stage.radii[~fixed], color)
+        _lay_over(picture, ghost, behind, np.where(ghost.edges(), 2.5 * _CLEAR, _CLEAR))
+    hand = Layer(film)
+    hand.add_spheres(stage.hand, np.full(len(stage.hand), 0.008), _HAND_COLOR)
+    _lay_over(picture, hand, behind, np.where(hand.depth < behind, 1.0, 0.35), hidden_too=True)
+    return np.clip(halved(picture), 0.0, 1.0)
+
+
+def _lay_over(
+    picture: np.ndarray,
+    layer: Layer,
+    behind: np.ndarray,
+    share: np.ndarray,
+    *,
+    hidden_too: bool = False,
+) -> None:
+    """Mix a layer into the picture where it is in front (or everywhere it is)."""
+    there = np.isfinite(layer.depth) & (hidden_too | (layer.depth < behind))
+    weight = share[there][:, None]
+    picture[there] = (1 - weight) * picture[there] + weight * layer.shaded()[there]
+
+
+def _corners(mesh: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray]:
+    """Return triangles and the normals at their corners; sharp edges stay sharp."""
+    triangles = np.asarray(mesh.triangles, dtype=np.float64)
+    faces = np.asarray(mesh.faces)
+    own = np.repeat(np.asarray(mesh.face_normals)[:, None], 3, axis=1)
+    smooth = np.asarray(mesh.vertex_normals)[faces]
+    alike = np.einsum("ijk,ijk->ij", own, smooth) > 0.8
+    return triangles, np.where(alike[..., None], smooth, own)
+
+
+def _shade(stage: _Stage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the table's rectangle and its brightness under what stands over it."""
+    from scipy.ndimage import gaussian_filter
+
+    points = stage.points()[:, :2]
+    low, high = points.min(axis=0) - 0.12, points.max(axis=0) + 0.12
+    cell = 0.006
+    shape = tuple(int(n) for n in np.ceil((high - low) / cell) + 1)
+    covered = np.zeros(shape)
+    x, y = (low[k] + cell * np.arange(shape[k]) for k in range(2))
+    for centers in (stage.centers[0], stage.centers[-1]):
+        for center, radius in zip(centers, stage.radii, strict=True):
+            near = (x[:, None] - center[0]) ** 2 + (y[None] - center[1]) ** 2 < radius**2
+            covered[near] = np.maximum(covered[near], 0.16)
+    for mesh in stage.meshes.values():
+        spots = np.round((np.asarray(mesh.triangles_center)[:, :2] - low) / cell).astype(int)
+        covered[spots[:, 0], spots[:, 1]] = 0.4
+    return low, high, 1.0 - gaussian_filter(covered, 0.014 / cell)
 
 
 def resample(path: Float[np.ndarray, "t dof"], count: int) -> Float[np.ndarray, "count dof"]:
@@ -103,91 +207,6 @@ def hand_path(robot: "Robot", path: Float[np.ndarray, "t dof"]) -> Float[np.ndar
     return sphere_centers(robot, path)[:, np.asarray(robot.sphere_links) == last].mean(axis=1)
 
 
-def _extent(
-    meshes: "Mapping[int, trimesh.Trimesh]", centers: np.ndarray
-) -> tuple[np.ndarray, float]:
-    points = [centers.reshape(-1, 3), *(np.asarray(mesh.vertices) for mesh in meshes.values())]
-    everything = np.concatenate(points)
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    return 0.5 * (low + high), float(np.linalg.norm(high - low)) / 2
-
-
-def _table(middle: np.ndarray, size: float, height: float) -> Painter:
-    table = Painter()
-    reach = 0.95 * size
-    table.add(sheet(middle[:2] - reach, middle[:2] + reach, height, 14), _TABLE_COLOR, ambient=1.0)
-    return table
-
-
-def _compose(
-    meshes: "Mapping[int, trimesh.Trimesh]",
-    robot: "Robot",
-    centers: np.ndarray,
-    dense: np.ndarray,
-    ghosts: int,
-) -> Painter:
-    painter = Painter()
-    for object_id, mesh in meshes.items():
-        triangles = np.asarray(mesh.triangles, dtype=np.float64)
-        normals = np.asarray(mesh.vertex_normals)[np.asarray(mesh.faces)].mean(axis=1)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        painter.add(triangles, tuple(object_color(object_id)), normals=normals)
-    radii = np.asarray(robot.sphere_radii)
-    fine, coarse = unit_sphere(2), unit_sphere(1)
-    for index in np.linspace(0, len(dense) - 1, ghosts + 2).astype(int)[1:-1]:
-        share = index / (len(dense) - 1)
-        color = tuple((1 - share) * np.array(START_COLOR) + share * np.array(GOAL_COLOR))
-        _add_spheres(painter, coarse, centers[index], radii, (*color, 0.13))
-    fixed = np.linalg.norm(centers[0] - centers[-1], axis=1) < 1e-6
-    _add_spheres(painter, fine, centers[0][fixed], radii[fixed], (0.62, 0.62, 0.64))
-    _add_spheres(painter, fine, centers[0][~fixed], radii[~fixed], START_COLOR)
-    _add_spheres(painter, fine, centers[-1][~fixed], radii[~fixed], GOAL_COLOR)
-    painter.add_tube(hand_path(robot, dense), 0.006, _HAND_COLOR)
-    return painter
-
-
-def _add_spheres(
-    painter: Painter,
-    ball: np.ndarray,
-    centers: np.ndarray,
-    radii: np.ndarray,
-    color: Sequence[float],
-) -> None:
-    for center, radius in zip(centers, radii, strict=True):
-        normals = ball.mean(axis=1)
-        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        painter.add(center + radius * ball, tuple(color), normals=normals)
-
-
-def _fit(
-    axis: Axes,
-    view: View,
-    meshes: "Mapping[int, trimesh.Trimesh]",
-    centers: np.ndarray,
-    table_height: float,
-) -> None:
-    points = np.concatenate(
-        [centers.reshape(-1, 3), *(np.asarray(mesh.vertices) for mesh in meshes.values())]
-    )
-    shadow = points.copy()
-    shadow[:, 2] = table_height
-    flat, _ = view.project(np.concatenate([points, shadow]))
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    pad = 0.06 * float((high - low).max())
-    axis.set_xlim(low[0] - pad, high[0] + pad)
-    axis.set_ylim(low[1] - pad, high[1] + pad)
-
-
-def _mark(axis: Axes, view: View, camera_center: np.ndarray | None) -> None:
-    if camera_center is None:
-        return
-    flat, _ = view.project(np.asarray(camera_center, dtype=np.float64)[None])
-    (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
-    if x0 < flat[0, 0] < x1 and y0 < flat[0, 1] < y1:
-        axis.plot(*flat[0], marker="^", color="black", markersize=8)
-        axis.annotate("camera", flat[0], xytext=(6, 4), textcoords="offset points", fontsize=9)
-
-
 def _legend(figure: Figure, meshes: "Mapping[int, trimesh.Trimesh]") -> None:
     entries: list[Patch | Line2D] = [
         Patch(color=START_COLOR, label="start"),
@@ -195,4 +214,4 @@ def _legend(figure: Figure, meshes: "Mapping[int, trimesh.Trimesh]") -> None:
         Line2D([], [], color=_HAND_COLOR, linewidth=3, label="path of the hand"),
     ]
     entries += [Patch(color=tuple(object_color(k)), label=f"object {k}") for k in sorted(meshes)]
-    figure.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), 10))
+    figure.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), 7))

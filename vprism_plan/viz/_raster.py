@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A small depth-buffered renderer for spheres and triangles, in numpy.
+
+matplotlib's 3-D axes sort whole collections, so robots appear in front of what they
+stand behind. Here every pixel asks which surface is nearest. Layers can be laid over
+each other clear: a robot's pose in between is one silhouette, not a heap of discs.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+_LIGHT = np.array([0.30, -0.35, 0.89]) / np.linalg.norm([0.30, -0.35, 0.89])
+_NOTHING = np.float32(np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A perspective view from `eye` to `target` (world, z up, metres)."""
+
+    eye: np.ndarray
+    target: np.ndarray
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Columns right, up, forward (3, 3)."""
+        forward = self.target - self.eye
+        forward = forward / np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right = right / np.linalg.norm(right)
+        return np.stack([right, np.cross(right, forward), forward], axis=1)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return image-plane coordinates (..., 2), right and up, of points in front."""
+        local = (points - self.eye) @ self.axes
+        return np.asarray(local[..., :2] / np.maximum(local[..., 2:], 1e-3))
+
+
+@dataclass(eq=False)
+class Film:
+    """Pixels and their rays: a view, image-plane bounds, and how many pixels per unit."""
+
+    view: View
+    low: np.ndarray
+    high: np.ndarray
+    scale: float
+
+    def __post_init__(self) -> None:
+        self.width, self.height = (int(n) for n in np.ceil((self.high - self.low) * self.scale))
+        x = self.low[0] + (np.arange(self.width) + 0.5) / self.scale
+        y = self.high[1] - (np.arange(self.height) + 0.5) / self.scale
+        grid = np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1)
+        rays = grid @ self.view.axes.T
+        self.rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+
+    def window(self, points: np.ndarray, pad: float = 0.0) -> tuple[slice, slice] | None:
+        """Return the (rows, columns) that cover image-plane points, None if outside."""
+        low, high = points.min(axis=0) - pad, points.max(axis=0) + pad
+        left, right = (
+            int(v) for v in np.floor((np.array([low[0], high[0]]) - self.low[0]) * self.scale)
+        )
+        top, bottom = (
+            int(v) for v in np.floor((self.high[1] - np.array([high[1], low[1]])) * self.scale)
+        )
+        rows = slice(max(top, 0), min(bottom + 1, self.height))
+        columns = slice(max(left, 0), min(right + 1, self.width))
+        if rows.start >= rows.stop or columns.start >= columns.stop:
+            return None
+        return rows, columns
+
+
+@dataclass(eq=False)
+class Layer:
+    """What is nearest in every pixel: distance, outward normal, colour."""
+
+    film: Film
+    depth: np.ndarray = field(init=False)
+    normal: np.ndarray = field(init=False)
+    color: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        shape = (self.film.height, self.film.width)
+        self.depth = np.full(shape, _NOTHING, dtype=np.float32)
+        self.normal = np.zeros((*shape, 3), dtype=np.float32)
+        self.color = np.ones((*shape, 3), dtype=np.float32)
+
+    def add_spheres(
+        self, centers: np.ndarray, radii: np.ndarray, color: np.ndarray | tuple[float, ...]
+    ) -> None:
+        """Add spheres (n, 3), radii (n,), metres, in one RGB colour."""
+        owner = np.full(self.depth.shape, -1, dtype=np.int32)
+        for index, (center, radius) in enumerate(zip(centers, radii, strict=True)):
+            offset = center - self.film.view.eye
+            ahead = float(offset @ self.film.view.axes[:, 2])
+            if ahead <= 2 * radius:
+                continue
+            # A ball's outline in perspective is at most this far from its middle's image.
+            pad = 1.3 * radius / (ahead - radius)
+            window = self.film.window(self.film.view.project(center)[None], pad)
+            if window is None:
+                continue
+            rays = self.film.rays[window]
+            along = rays @ offset.astype(np.float32)
+            inside = along**2 - np.float32(offset @ offset - radius**2)
+            t = along - np.sqrt(np.maximum(inside, 0.0))
+            closer = (inside > 0) & (t < self.depth[window])
+            self.depth[window][closer] = t[closer]
+            owner[window][closer] = index
+        hit = owner >= 0
+        who = owner[hit]
+        points = self.film.view.eye + self.depth[hit][:, None] * self.film.rays[hit]
+        self.normal[hit] = (points - centers[who]) / radii[who][:, None]
+        self.color[hit] = color
+
+    def add_mesh(
+        self,
+        triangles: np.ndarray,
+        normals: np.ndarray,
+        color: np.ndarray | tuple[float, ...],
+    ) -> None:
+        """Add triangles (n, 3, 3) with normals (n, 3, 3) at their corners, in one colour."""
+        eye = self.film.view.eye
+        face = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        facing = np.einsum("ij,ij->i", face, eye - triangles[:, 0]) > 1e-15
+        triangles, normals = triangles[facing], normals[facing]
+        # A ray r meets the plane of corners c at sum(w) = 1 with r t = C w: w / t = C^-1 r.
+        inverse = np.linalg.inv(np.swapaxes(triangles - eye, 1, 2))
+        pixel, which = self._candidates(self.film.view.project(triangles))
+        rays = self.film.rays.reshape(-1, 3)[pixel].astype(np.float64)
+        weights = np.einsum("ijk,ik->ij", inverse[which], rays)
+        inside = weights.min(axis=1) >= -1e-7
+        pixel, which, weights = pixel[inside], which[inside], weights[inside]
+        t = 1.0 / weights.sum(axis=1)
+        order = np.lexsort((t, pixel))
+        _, first = np.unique(pixel[order], return_index=True)
+        nearest = order[first]
+        nearest = nearest[t[nearest] < self.depth.reshape(-1)[pixel[nearest]]]
+        pixel, which = pixel[nearest], which[nearest]
+        normal = np.einsum("ij,ijk->ik", weights[nearest] * t[nearest, None], normals[which])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        self.depth.reshape(-1)[pixel] = t[nearest]
+        self.normal.reshape(-1, 3)[pixel] = normal
+        self.color.reshape(-1, 3)[pixel] = color
+
+    def _candidates(self, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return pixels and triangles (m,), (m,): every pixel in the box of each triangle."""
+        film = self.film
+        limit = np.array([film.width, film.height]) - 1
+        corner = np.stack([flat.min(axis=1), flat.max(axis=1)])
+        x = (corner[..., 0] - film.low[0]) * film.scale
+        y = (film.high[1] - corner[::-1, :, 1]) * film.scale
+        box = np.floor(np.stack([x, y], axis=-1)).astype(np.int64)
+        low, high = np.maximum(box[0], 0), np.minimum(box[1], limit)
+        size = np.maximum(high - low + 1, 0)
+        count = size[:, 0] * size[:, 1]
+        which = np.repeat(np.arange(len(flat)), count)
+        number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+        row = low[which, 1] + number // size[which, 0]
+        column = low[which, 0] + number % size[which, 0]
+        return row * film.width + column, which
+
+    def shaded(self) -> np.ndarray:
+        """Return the lit colours (h, w, 3) with dark lines where the depth jumps."""
+        light = 0.42 + 0.58 * np.clip(0.45 + 0.55 * (self.normal @ _LIGHT.astype(np.float32)), 0, 1)
+        picture = self.color * light[..., None]
+        return np.asarray(np.where(self.edges()[..., None], 0.55 * picture, picture))
+
+    def edges(self) -> np.ndarray:
+        """Return where the depth jumps to a farther neighbour by more than 2 cm."""
+        depth = np.where(np.isfinite(self.depth), self.depth, np.float32(1e3))
+        jump = np.zeros(depth.shape, dtype=bool)
+        jump[1:] |= depth[:-1] - depth[1:] > 0.02
+        jump[:-1] |= depth[1:] - depth[:-1] > 0.02
+        jump[:, 1:] |= depth[:, :-1] - depth[:, 1:] > 0.02
+        jump[:, :-1] |= depth[:, 1:] - depth[:, :-1] > 0.02
+        return jump & np.isfinite(self.depth)
+
+
+def ground(
+    film: Film, height: float, low: np.ndarray, high: np.ndarray, shade: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the picture (h, w, 3) and distance of a table top, white elsewhere.
+
+    shade: (nx, ny) brightness over the rectangle low..high (world xy, metres).
+    """
+    rays, eye = film.rays.astype(np.float64), film.view.eye
+    slope = np.where(np.abs(rays[..., 2]) < 1e-9, -1e-9, rays[..., 2])
+    t = (height - eye[2]) / slope
+    xy = eye[:2] + t[..., None] * rays[..., :2]
+    on = (t > 0) & (xy >= low).all(axis=-1) & (xy <= high).all(axis=-1)
+    cell = ((xy - low) / (high - low) * (np.array(shade.shape) - 1)).clip(
+        0, np.array(shade.shape) - 1
+    )
+    brightness = shade[tuple(np.moveaxis(cell.round().astype(int), -1, 0))]
+    # Lines every 10 cm give the eye a measure of length.
+    line = (np.abs((xy + 0.05) % 0.1 - 0.05) < 0.0012).any(axis=-1)
+    picture = np.ones((*on.shape, 3))
+    color = np.array([0.90, 0.89, 0.87]) * brightness[..., None]
+    picture[on] = np.where(line[..., None], 0.92 * color, color)[on]
+    return picture, np.where(on, t, np.inf)
+
+
+def halved(picture: np.ndarray) -> np.ndarray:
+    """Average blocks of 2 x 2 pixels."""
+    h, w = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
+    p = picture[:h, :w]
+    return np.asarray(0.25 * (p[::2, ::2] + p[1::2, ::2] + p[::2, 1::2] + p[1::2, 1::2]))
