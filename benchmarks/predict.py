@@ -56,6 +56,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     torch.set_num_threads(worker_count())
+    torch.set_flush_denormal(True)  # fair to the dense side, whose kernel values underflow
     fitted = fit_map(random_scene(args.objects, args.seed).observation)
     print(f"{args.objects} objects, {len(fitted.hinge_points)} hinge points")
     lower, upper = fitted.support_bounds()

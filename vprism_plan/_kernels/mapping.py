@@ -622,29 +622,32 @@ def point_jacobians(
 
 
 @njit(cache=True, nogil=True, fastmath=False)
-def normalised_log_odds(mean, var, lo, hi, limit, out):
-    """log(P(occupied) / P(empty)) of rows lo..hi, cut off at +-limit.
+def _log_scores(mean, var, r, scores):
+    """log q_k of row r, the approximation of Daunizeau before it is normalised.
 
-    With u_ki = (m_k - m_i) / sqrt(1 + pi/8 (v_k + v_i)), the approximation of Daunizeau
-    is q_k = 1 / (1 + sum_{i != k} exp(-u_ki)); the odds need no normalisation.
+    With u_ki = (m_k - m_i) / sqrt(1 + pi/8 (v_k + v_i)): q_k = 1 / sum_i exp(-u_ki), where
+    the term i = k is the 1.
     """
+    K = mean.shape[1]
+    for k in range(K):
+        largest = 0.0
+        for i in range(K):
+            spread = math.sqrt(1.0 + math.pi / 8.0 * (var[r, k] + var[r, i]))
+            largest = max(largest, (mean[r, i] - mean[r, k]) / spread)
+        total = 0.0
+        for i in range(K):
+            spread = math.sqrt(1.0 + math.pi / 8.0 * (var[r, k] + var[r, i]))
+            total += math.exp((mean[r, i] - mean[r, k]) / spread - largest)
+        scores[k] = -(largest + math.log(total))
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def normalised_log_odds(mean, var, lo, hi, limit, out):
+    """log(P(occupied) / P(empty)) of rows lo..hi, cut off at +-limit."""
     K = mean.shape[1]
     scores = np.empty(K)
     for r in range(lo, hi):
-        for k in range(K):
-            largest = 0.0
-            for i in range(K):
-                u = (mean[r, i] - mean[r, k]) / math.sqrt(
-                    1.0 + math.pi / 8.0 * (var[r, k] + var[r, i])
-                )
-                largest = max(largest, u)
-            total = 0.0
-            for i in range(K):
-                u = (mean[r, i] - mean[r, k]) / math.sqrt(
-                    1.0 + math.pi / 8.0 * (var[r, k] + var[r, i])
-                )
-                total += math.exp(u - largest)
-            scores[k] = -(largest + math.log(total))
+        _log_scores(mean, var, r, scores)
         top = scores[1]
         for k in range(2, K):
             top = max(top, scores[k])
@@ -653,6 +656,23 @@ def normalised_log_odds(mean, var, lo, hi, limit, out):
             total += math.exp(scores[k] - top)
         odds = top + math.log(total) - scores[0]
         out[r] = min(max(odds, -limit), limit)
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def normalised_log_probabilities(mean, var, lo, hi, out):
+    """log P(class) of rows lo..hi; their exponentials sum to 1."""
+    K = mean.shape[1]
+    scores = np.empty(K)
+    for r in range(lo, hi):
+        _log_scores(mean, var, r, scores)
+        top = scores[0]
+        for k in range(1, K):
+            top = max(top, scores[k])
+        total = 0.0
+        for k in range(K):
+            total += math.exp(scores[k] - top)
+        for k in range(K):
+            out[r, k] = scores[k] - top - math.log(total)
 
 
 # ---------------------------------------------------------------- envelopes

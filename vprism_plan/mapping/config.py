@@ -31,6 +31,7 @@ _RULES: dict[str, tuple[str, Callable]] = {
     "hinge_radius": _POSITIVE,
     "hinge_margin": _NON_NEGATIVE,
     "hinge_depth": _NON_NEGATIVE,
+    "box_trim": ("at least 0 and below 0.25", lambda v: _finite(v) and 0 <= v < 0.25),
     "surface_hinges": _whole(0),
     "iterations": _whole(1),
     "variational_updates": _whole(1),
@@ -74,6 +75,9 @@ class MapConfig:
         hinge_shift: offset of the lattice from multiples of the spacing, m.
         hinge_radius: lattice nodes are kept this near an object's box centre, m ...
         hinge_margin: ... or this near its axis-aligned box, m.
+        box_trim: share of an object's points left out of its box at each end of each
+            axis. Flying pixels at depth edges otherwise stretch boxes, and with them the
+            lattice and the negative samples, by several times (the paper: 0).
         hinge_depth: nodes deeper than this under the plane are dropped, m; None keeps all.
         surface_hinges: random surface points taken as hinges, per object.
         max_hinges: refuse to build more (memory and time grow with the cube).
@@ -114,6 +118,7 @@ class MapConfig:
     hinge_radius: float = 0.12
     hinge_margin: float = 0.08
     hinge_depth: float | None = 0.05
+    box_trim: float = 0.01
     surface_hinges: int = 48
     max_hinges: int = 6000
     iterations: int = 6
@@ -168,6 +173,7 @@ class MapConfig:
             hinge_radius=0.15,
             hinge_margin=0.0,
             hinge_depth=None,
+            box_trim=0.0,
             surface_hinges=32,
             iterations=3,
             variational_updates=1,

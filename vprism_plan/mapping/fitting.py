@@ -113,7 +113,7 @@ def training_data(
     clouds = [view.points() for view in views]
     points = np.concatenate([cloud for cloud, _ in clouds])
     labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
-    lower, upper = negatives.box_centers(points, labels, object_ids)
+    lower, upper = negatives.box_centers(points, labels, object_ids, config.box_trim)
     centers = 0.5 * (lower + upper)
     empty = [points[labels == 0]]
     front: list[np.ndarray] = []

@@ -12,16 +12,19 @@ from vprism_plan._kernels import mapping as kernels
 
 
 def box_centers(
-    points: Float[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], object_ids: tuple[int, ...]
+    points: Float[np.ndarray, "n 3"],
+    labels: Int[np.ndarray, " n"],
+    object_ids: tuple[int, ...],
+    trim: float = 0.0,
 ) -> tuple[Float[np.ndarray, "c 3"], Float[np.ndarray, "c 3"]]:
     """Return the lower and upper corners (m) of each object's axis-aligned box.
 
     Rows follow `object_ids`; the centres o_k of the paper are the means of the two.
-    Every id must own at least one point.
+    Every id must own at least one point. A share `trim` of an object's points may stick
+    out at each end of each axis.
     """
-    lower = np.stack([points[labels == k].min(axis=0) for k in object_ids])
-    upper = np.stack([points[labels == k].max(axis=0) for k in object_ids])
-    return lower, upper
+    corners = [np.quantile(points[labels == k], [trim, 1.0 - trim], axis=0) for k in object_ids]
+    return np.stack([c[0] for c in corners]), np.stack([c[1] for c in corners])
 
 
 def sample_rays(

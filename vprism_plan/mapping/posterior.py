@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`VPrismMap`: the fitted posterior and the questions it answers."""
 
-from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -114,22 +113,33 @@ class VPrismMap:
         is taken as a numpy array and gives float64 numpy. Normalised approximation of
         section IV-B. MapError on a wrong shape or a value that is not finite.
         """
-        return self._evaluate(points, lambda m, v, s: prediction.class_probabilities(m, v))
+        if isinstance(points, Tensor):
+            return prediction.class_probabilities(*self._torch_moments(points)[:2]).to(points.dtype)
+        return np.exp(self._log_probabilities(points))
 
     def occupancy(self, points: Any) -> Any:
         """Return P(occupied) = 1 - P(class 0) for points (N, 3) m: (N,)."""
-        return self._evaluate(points, lambda m, v, s: prediction.occupied_probability(m, v))
+        if isinstance(points, Tensor):
+            return prediction.occupied_probability(*self._torch_moments(points)[:2]).to(
+                points.dtype
+            )
+        return np.exp(self._log_probabilities(points)[:, 1:]).sum(axis=1)
 
     def entropy(self, points: Any) -> Any:
         """Return the entropy (nats) of the class probabilities at points (N, 3) m: (N,)."""
-        return self._evaluate(points, lambda m, v, s: prediction.class_entropy(m, v))
+        if isinstance(points, Tensor):
+            return prediction.class_entropy(*self._torch_moments(points)[:2]).to(points.dtype)
+        log_p = self._log_probabilities(points)
+        return -(np.exp(log_p) * log_p).sum(axis=1)
 
     def support(self, points: Any) -> Any:
         """Return the kernel mass at points (N, 3) m: the sum of all kernel values, no bias: (N,).
 
         0 means that the map knows nothing there but its prior.
         """
-        return self._evaluate(points, lambda m, v, s: s)
+        if isinstance(points, Tensor):
+            return self._torch_moments(points)[2].to(points.dtype)
+        return self._moments(_checked_points(points))[2]
 
     def logit_moments(
         self, points: Any
@@ -218,25 +228,32 @@ class VPrismMap:
         run_chunked(chunk, len(block_start) - 1, 512)
         return mean, variance, support
 
-    def _evaluate(self, points: Any, question: Callable[..., Tensor]) -> Any:
-        if not isinstance(points, Tensor):
-            values = [torch.from_numpy(a) for a in self._moments(_checked_points(points))]
-            return question(*values).numpy()
+    def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
+        mean, variance, _ = self._moments(_checked_points(points))
+        out = np.empty_like(mean)
+
+        def chunk(piece: slice) -> None:
+            kernels.normalised_log_probabilities(mean, variance, piece.start, piece.stop, out)
+
+        run_chunked(chunk, len(out), 16384)
+        return out
+
+    def _torch_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return moments and kernel mass, float64, attached to the points' graph."""
         if not points.is_floating_point():
             raise MapError(f"points have dtype {points.dtype}; use float32 or float64")
         _check_shape(tuple(points.shape))
         if not bool(torch.isfinite(points).all()):
             raise MapError("points hold NaN or infinity; every coordinate must be finite (m)")
         if points.device.type != "cpu":
-            return question(*self._dense_moments(points)).to(points.dtype)
+            return self._dense_moments(points)
         if points.requires_grad and torch.is_grad_enabled():
-            moments = prediction.LogitMoments.apply(
+            return prediction.LogitMoments.apply(
                 points.to(torch.float64), self.space, self.posterior.mean, self.posterior.covariance
             )
-        else:
-            array = np.ascontiguousarray(points.detach().to(torch.float64).numpy())
-            moments = tuple(torch.from_numpy(a) for a in self._moments(array))
-        return question(*moments).to(points.dtype)
+        array = np.ascontiguousarray(points.detach().to(torch.float64).numpy())
+        mean, variance, support = self._moments(array)
+        return torch.from_numpy(mean), torch.from_numpy(variance), torch.from_numpy(support)
 
     def _dense_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Evaluate on the points' own device with plain torch (float64 where it has that)."""
