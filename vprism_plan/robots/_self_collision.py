@@ -79,7 +79,7 @@ def random_configurations(
 
 def drop_always_touching(
     arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"], names: Sequence[str]
-) -> Int[np.ndarray, "pairs 2"]:
+) -> Int[np.ndarray, "kept 2"]:
     """Without an SRDF: leave out pairs whose spheres overlap in every sample.
 
     Such a pair overlaps because of how the links are built (or of how coarse the

@@ -55,7 +55,7 @@ def lock_values(
         joint = model.joint_map[name]
         stated = semantics.state_value(name)
         if name in given:
-            value = _number(name, given[name])
+            value = float(given[name])
         elif stated is not None:
             value = stated
         else:
@@ -68,15 +68,6 @@ def lock_values(
             )
         values[name] = value
     return values
-
-
-def _number(name: str, value: object) -> float:
-    try:
-        return float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError) as error:
-        raise RobotError(
-            f"joint '{name}' is locked at {value!r}; give a number (radians or metres)"
-        ) from error
 
 
 def rigid_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:

@@ -193,7 +193,8 @@ class Robot:
             q: Configurations, float32 or float64, any device and batch shape.
 
         Returns:
-            Centres in metres, same dtype and device, differentiable in q (any order).
+            Centres in metres, same dtype and device, differentiable in q to any order.
+            Batched already: torch.vmap over it is not supported.
 
         Raises:
             RobotError: q has another dtype, a wrong last dimension, or values that
@@ -210,11 +211,14 @@ class Robot:
         world = local @ base[:3, :3].T + base[:3, 3]
         return world.reshape(*q.shape[:-1], *world.shape[1:])
 
-    def link_poses(self, q: ArrayLike) -> dict[str, np.ndarray]:
+    def link_poses(self, q: Any) -> dict[str, np.ndarray]:
         """World poses of all links of the URDF.
 
         Args:
             q: (dof,) configuration.
+
+        Raises:
+            RobotError: See :meth:`check_configuration`.
 
         Returns:
             Link name -> (4, 4).
@@ -240,7 +244,7 @@ class Robot:
             RobotError: The length is wrong or a value is not a finite number.
         """
         try:
-            array = np.array(q, dtype=np.float64, order="C")
+            array = np.array(np.asarray(q), dtype=np.float64, order="C")
         except (TypeError, ValueError, RuntimeError) as error:
             raise RobotError(
                 f"a configuration of {self.name} cannot be read from {type(q).__name__}: {error}; "
