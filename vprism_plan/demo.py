@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 BASE_XYZ = (0.05, -0.6, 0.0)  # metres, beside the clutter
 BASE_YAW = np.pi / 2  # radians, facing it
+MARGIN = 0.005  # metres that every sphere keeps from all that may be occupied
 
 
 def run_demo(output: Path, seed: int, console: "Console") -> int:
@@ -27,7 +28,7 @@ def run_demo(output: Path, seed: int, console: "Console") -> int:
     from vprism_plan.cli._motions import choose_ends, solve
     from vprism_plan.cli._outcome import Situation
     from vprism_plan.cli._placing import Surroundings, base_pose
-    from vprism_plan.collision import CollisionChecker
+    from vprism_plan.collision import CheckerConfig, CollisionChecker
     from vprism_plan.errors import PlanningError
     from vprism_plan.evaluation import load_ground_truth
     from vprism_plan.robots import Robot
@@ -41,7 +42,7 @@ def run_demo(output: Path, seed: int, console: "Console") -> int:
     around = Surroundings.of(m)
     pose = base_pose(np.array(BASE_XYZ), around, BASE_YAW)
     robot = Robot.from_urdf(urdf_path("panda"), base_pose=pose)
-    checker = CollisionChecker(world, robot)
+    checker = CollisionChecker(world, robot, CheckerConfig(margin=MARGIN))
     with console.stage("place"):
         # Left of the arm is the camera's side: it starts where everything is seen.
         ends = choose_ends(checker, around, np.random.default_rng(seed))

@@ -268,15 +268,18 @@ def choose_ends(
         at = end[:3, 3] if end.shape == (4, 4) else hand_path(robot, end[None])[0]
         return 1.0 if (at - middle) @ left > 0 else -1.0
 
-    def reach(sign: float) -> np.ndarray | None:
+    def reach(sign: float, like: np.ndarray) -> np.ndarray | None:
         edge = around.half_width(left[:2])
         target = sides[1 if sign > 0 else 0]
-        return reach_for(checker, target, lambda hand: sign * ((hand - middle) @ left) > edge, rng)
+        return reach_for(
+            checker, target, lambda hand: sign * ((hand - middle) @ left) > edge, like, rng
+        )
 
     first = None if start is None else np.asarray(start, dtype=np.float64)
     last = None if goal is None else np.asarray(goal, dtype=np.float64)
     if first is None:
-        first = reach(-1.0 if last is None else -side_of(last))
+        known = last is not None and last.ndim == 1
+        first = reach(-1.0 if last is None else -side_of(last), last if known else robot.neutral)
     if first is not None and last is None:
-        last = reach(-side_of(first))
+        last = reach(-side_of(first), first)
     return None if first is None or last is None else (first, last)

@@ -139,7 +139,7 @@ def true_distance(
 
     robot = checker.robot
     moving = ~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
-    dense = dense_path(path, 0.004)
+    dense = dense_path(path, 0.0015)
     best, at, largest_step = np.inf, (0, 0), 0.0
     previous: np.ndarray | None = None
     for begin in range(0, len(dense), 256):

@@ -21,6 +21,7 @@ _BEARINGS = np.deg2rad([0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0])
 _SHARES_OF_REACH = (0.5, 0.4, 0.6, 0.7)
 _ASIDE = 0.12  # metres between the objects' edge and where the hand starts or ends
 _ACCEPT = 0.15  # metres between the hand and where it should be
+_ODDNESS = 0.04  # metres of distance that a radian away from the usual posture is worth
 _SAMPLES = 2048
 
 
@@ -63,7 +64,8 @@ class Surroundings:
         ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
         left = np.array([-ahead[1], ahead[0]])
         away = self.half_width(left) + _ASIDE
-        height = self.table + 0.12 + 0.5 * (float(self.points[:, 2].max()) - self.table)
+        # Low enough that what stands between must be crossed, not flown over.
+        height = self.table + 0.10 + 0.2 * (float(self.points[:, 2].max()) - self.table)
         return np.array([[*(self.middle + s * away * left), height] for s in (-1.0, 1.0)])
 
 
@@ -110,28 +112,29 @@ def reach_for(
     checker: "CollisionChecker",
     target: Float[np.ndarray, "3"],
     beyond: Callable[[np.ndarray], np.ndarray],
+    like: Float[np.ndarray, "dof"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "dof"] | None:
     """Return a valid configuration with the hand near `target` (metres), or None.
 
-    Samples around the robot's neutral posture, then around the best ones, so that the
-    posture stays natural. `beyond` says of hand positions (n, 3) which are on the right side.
+    Samples around the posture `like`, then around the best ones, and prefers postures
+    that resemble it. `beyond` says of hand positions (n, 3) which are on the right side.
     """
     from vprism_plan.viz import hand_path
 
     robot = checker.robot
     span = robot.upper - robot.lower
-    best = np.asarray(robot.neutral)[None]
-    found, score = None, np.inf
-    for spread in (0.25, 0.25, 0.08, 0.03, 0.01):
+    best = np.asarray(like)[None]
+    found, score, near = None, np.inf, False
+    for spread in (0.12, 0.12, 0.06, 0.03, 0.01):
         seeds = best[rng.integers(len(best), size=_SAMPLES)]
         sample = np.clip(
             seeds + spread * span * rng.standard_normal(seeds.shape), robot.lower, robot.upper
         )
         sample = np.concatenate([best, sample])
         hand = hand_path(robot, sample)
-        odd = np.abs((sample - robot.neutral) / span).mean(axis=1)
-        cost = np.linalg.norm(hand - target, axis=1) + 0.25 * odd
+        cost = np.linalg.norm(hand - target, axis=1)
+        cost += _ODDNESS * np.linalg.norm(sample - like, axis=1)
         cost[~checker.is_valid_batch(sample)] += 10.0
         cost[~beyond(hand)] += 10.0
         order = np.argsort(cost, kind="stable")

@@ -183,21 +183,20 @@ def ground(
 
     shade: (nx, ny) brightness over the rectangle low..high (world xy, metres).
     """
-    rays, eye = film.rays.astype(np.float64), film.view.eye
-    slope = np.where(np.abs(rays[..., 2]) < 1e-9, -1e-9, rays[..., 2])
-    t = (height - eye[2]) / slope
-    xy = eye[:2] + t[..., None] * rays[..., :2]
-    on = (t > 0) & (xy >= low).all(axis=-1) & (xy <= high).all(axis=-1)
-    cell = ((xy - low) / (high - low) * (np.array(shade.shape) - 1)).clip(
-        0, np.array(shade.shape) - 1
-    )
-    brightness = shade[tuple(np.moveaxis(cell.round().astype(int), -1, 0))]
+    rays, eye = film.rays, film.view.eye.astype(np.float32)
+    slope = np.where(np.abs(rays[..., 2]) < 1e-9, np.float32(-1e-9), rays[..., 2])
+    t = (np.float32(height) - eye[2]) / slope
+    x, y = (eye[k] + t * rays[..., k] for k in range(2))
+    on = (t > 0) & (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+    xy = np.stack([x[on], y[on]], axis=1)
+    last = np.array(shade.shape) - 1
+    cell = np.round((xy - low) / (high - low) * last).astype(np.int64).clip(0, last)
     # Lines every 10 cm give the eye a measure of length.
-    line = (np.abs((xy + 0.05) % 0.1 - 0.05) < 0.0012).any(axis=-1)
-    picture = np.ones((*on.shape, 3))
-    color = np.array([0.90, 0.89, 0.87]) * brightness[..., None]
-    picture[on] = np.where(line[..., None], 0.92 * color, color)[on]
-    return picture, np.where(on, t, np.inf)
+    line = (np.abs((xy + 0.05) % 0.1 - 0.05) < 0.0012).any(axis=1)
+    brightness = shade[cell[:, 0], cell[:, 1]] * np.where(line, 0.92, 1.0)
+    picture = np.ones((*on.shape, 3), dtype=np.float32)
+    picture[on] = np.array([0.90, 0.89, 0.87]) * brightness[:, None]
+    return picture, np.where(on, t, _NOTHING)
 
 
 def halved(picture: np.ndarray) -> np.ndarray:

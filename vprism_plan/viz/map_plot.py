@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -73,8 +73,9 @@ def map_figure(
         title: above all panels.
     """
     slices = _slices(m, resolution)
-    figure = new_figure(13.0, 8.8)
-    axes = figure.subplots(2, 2)
+    heights = [len(plane.b) / len(plane.a) for plane in slices]
+    figure = new_figure(12.6, 4.9 * sum(heights) + 1.7)
+    axes = figure.subplots(2, 2, sharex=True, gridspec_kw={"height_ratios": heights})
     if title:
         figure.suptitle(title)
     for row, plane in enumerate(slices):
@@ -83,7 +84,7 @@ def map_figure(
         support = plane.image(m.support(points))
         occupancy = plane.image(m.occupancy(points))
         panels = (
-            ("P(occupied)", occupancy, "viridis", 1.0, "probability of being occupied"),
+            ("P(occupied)", occupancy, "viridis", 1.0, "probability"),
             ("entropy", m.entropy(points), "magma", float(np.log(m.n_classes)), "entropy (nats)"),
         )
         for column, (name, values, cmap, top, label) in enumerate(panels):
@@ -96,8 +97,8 @@ def map_figure(
                 vmin=0,
                 vmax=top,
             )
-            figure.colorbar(image, ax=axis, label=label, shrink=0.9)
-            axis.set_title(f"{name}: {plane.title}")
+            figure.colorbar(image, cax=axis.inset_axes((1.02, 0.0, 0.035, 1.0)), label=label)
+            axis.set_title(f"{name}, {plane.title}", fontsize=10)
             axis.set_xlabel(plane.a_label)
             axis.set_ylabel(plane.b_label)
             _overlay(axis, plane, m, hidden, support, occupancy, truth)
@@ -106,37 +107,47 @@ def map_figure(
 
 
 def _slices(m: "VPrismMap", resolution: float) -> tuple[_Slice, _Slice]:
+    """Both slices share their first axis, the direction in which the camera looks."""
     seen = [view.points() for view in m.views]
     objects = np.concatenate([points[labels > 0] for points, labels in seen])
     low, high = np.percentile(objects, [0.5, 99.5], axis=0)
-    table = float(m.plane.offset / m.plane.normal[2])
-    height = table + 0.5 * (float(high[2]) - table)
     middle = 0.5 * (low + high)
-    grids = [np.arange(low[k] - _PAD, high[k] + _PAD, resolution) for k in range(2)]
-    horizontal = _Slice(
-        f"horizontal slice, {100 * (height - table):.1f} cm above the table",
-        np.array([0.0, 0.0, height]),
-        np.array([1.0, 0.0, 0.0]),
-        np.array([0.0, 1.0, 0.0]),
-        *grids,
-        "x (m)",
-        "y (m)",
-    )
+    normal = m.plane.normal
+    table = float((m.plane.offset - normal[:2] @ middle[:2]) / normal[2])
+    top = float(high[2])
     sight = middle - m.views[0].camera_center
     sight[2] = 0.0
+    if np.linalg.norm(sight) < 0.02:  # seen from straight above
+        sight = np.array([1.0, 0.0, 0.0])
     sight /= np.linalg.norm(sight)
+    left = np.array([-sight[1], sight[0], 0.0])
     middle[2] = 0.0
-    reach = np.abs((objects - middle) @ sight)
-    half = float(np.percentile(reach, 99.5)) + _PAD
+    reach, aside = (
+        float(np.percentile(np.abs((objects - middle) @ axis), 99.5)) + _PAD
+        for axis in (sight, left)
+    )
+    # What hides behind the objects is the point of the picture: room for it.
+    along = np.arange(-reach, reach + 0.10, resolution)
+    height = table + 0.5 * (top - table)
+    horizontal = _Slice(
+        title=f"{100 * (height - table):.0f} cm above the table, seen from above",
+        origin=middle + np.array([0.0, 0.0, height]),
+        u=sight,
+        v=left,
+        a=along,
+        b=np.arange(-aside, aside, resolution),
+        a_label="",
+        b_label="to the camera's left (m)",
+    )
     vertical = _Slice(
-        "vertical slice along the line of sight (camera on the left)",
-        middle,
-        sight,
-        np.array([0.0, 0.0, 1.0]),
-        np.arange(-half, half, resolution),
-        np.arange(table - 0.04, float(high[2]) + _PAD, resolution),
-        "distance along the line of sight (m)",
-        "z (m)",
+        title="upright, through the middle of the objects",
+        origin=middle,
+        u=sight,
+        v=np.array([0.0, 0.0, 1.0]),
+        a=along,
+        b=np.arange(table - 0.03, top + _PAD, resolution),
+        a_label="along the line of sight (m); the camera is on the left",
+        b_label="height z (m)",
     )
     return horizontal, vertical
 
@@ -168,7 +179,7 @@ def _overlay(
     truth: Callable[[np.ndarray], np.ndarray] | None,
 ) -> None:
     """Observed points, occluded space, the border of support, true outlines, the table."""
-    grid = {"origin": "lower", "extent": plane.extent}
+    grid: dict[str, Any] = {"origin": "lower", "extent": plane.extent}
     if hidden.any() and not hidden.all():
         shade = axis.contourf(hidden, levels=[0.5, 1.5], colors="none", hatches=["///"], **grid)
         shade.set_edgecolor((1, 1, 1, 0.35))
@@ -190,7 +201,7 @@ def _overlay(
         spots = plane.locate(points[labels > 0])
         axis.plot(*spots.T, ".", markersize=1.6, color="#ffb000", rasterized=True)
     if plane.v[2] > 0.5:
-        axis.axhline(float(m.plane.offset / m.plane.normal[2]), color="#9ad0ff", linewidth=1.0)
+        axis.axhline(float(plane.b[0]) + 0.03, color="#9ad0ff", linewidth=1.0)
     axis.set_xlim(plane.extent[:2])
     axis.set_ylim(plane.extent[2:])
 
@@ -212,7 +223,7 @@ def _legend(figure: Figure, with_truth: bool) -> None:
     figure.legend(
         handles=entries,
         loc="outside lower center",
-        ncols=len(entries),
+        ncols=3,
         facecolor="#555555",
         labelcolor="white",
         framealpha=1.0,

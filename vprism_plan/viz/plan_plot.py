@@ -23,7 +23,7 @@ START_COLOR = (0.16, 0.44, 0.70)
 GOAL_COLOR = (0.85, 0.45, 0.13)
 _HAND_COLOR = (0.72, 0.05, 0.35)
 _BASE_COLOR = (0.66, 0.66, 0.68)
-_PIXELS = 1280  # along the longer side of a view, before averaging
+_PIXELS = 1120  # along the longer side of a view, before averaging
 _CLEAR = 0.16  # how much of a pose in between is seen
 
 
@@ -41,7 +41,8 @@ class _Stage:
 
     def points(self) -> np.ndarray:
         """Return points that must be in the picture, and their shadows on the table."""
-        shown = self.centers[[0, *self.ghosts, -1]].reshape(-1, 3)
+        around = self.radii[:, None, None] * np.concatenate([np.eye(3), -np.eye(3)])
+        shown = (self.centers[[0, *self.ghosts, -1]][:, :, None] + around).reshape(-1, 3)
         vertices = [np.asarray(mesh.vertices) for mesh in self.meshes.values()]
         points = np.concatenate([shown, *vertices])
         shadow = points.copy()
@@ -112,7 +113,7 @@ def _views(stage: _Stage, robot: "Robot") -> list[tuple[str, View]]:
 def _render(stage: _Stage, view: View) -> np.ndarray:
     """Return one view as an image (h, w, 3) in 0..1."""
     flat = view.project(stage.points())
-    pad = 0.07 * float((flat.max(axis=0) - flat.min(axis=0)).max())
+    pad = 0.03 * float((flat.max(axis=0) - flat.min(axis=0)).max())
     low, high = flat.min(axis=0) - pad, flat.max(axis=0) + pad
     film = Film(view, low, high, _PIXELS / float((high - low).max()))
     solid = Layer(film)
@@ -133,9 +134,18 @@ def _render(stage: _Stage, view: View) -> np.ndarray:
         ghost.add_spheres(stage.centers[row][~fixed], stage.radii[~fixed], color)
         _lay_over(picture, ghost, behind, np.where(ghost.edges(), 2.5 * _CLEAR, _CLEAR))
     hand = Layer(film)
-    hand.add_spheres(stage.hand, np.full(len(stage.hand), 0.008), _HAND_COLOR)
+    beads = _beads(stage.hand, 0.004)
+    hand.add_spheres(beads, np.full(len(beads), 0.008), _HAND_COLOR)
     _lay_over(picture, hand, behind, np.where(hand.depth < behind, 1.0, 0.35), hidden_too=True)
     return np.clip(halved(picture), 0.0, 1.0)
+
+
+def _beads(line: np.ndarray, spacing: float) -> np.ndarray:
+    """Return points along a polyline (n, 3) so close together that beads look like a tube."""
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(steps)])
+    at = np.linspace(0.0, along[-1], max(2, int(along[-1] / spacing)))
+    return np.stack([np.interp(at, along, column) for column in line.T], axis=1)
 
 
 def _lay_over(
@@ -214,4 +224,6 @@ def _legend(figure: Figure, meshes: "Mapping[int, trimesh.Trimesh]") -> None:
         Line2D([], [], color=_HAND_COLOR, linewidth=3, label="path of the hand"),
     ]
     entries += [Patch(color=tuple(object_color(k)), label=f"object {k}") for k in sorted(meshes)]
-    figure.legend(handles=entries, loc="outside lower center", ncols=min(len(entries), 7))
+    figure.legend(
+        handles=entries, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.7))
+    )
