@@ -32,6 +32,7 @@ _RULES: dict[str, tuple[str, Callable]] = {
     "hinge_margin": _NON_NEGATIVE,
     "hinge_depth": _NON_NEGATIVE,
     "box_trim": ("at least 0 and below 0.25", lambda v: _finite(v) and 0 <= v < 0.25),
+    "stray_share": ("at least 0 and below 1", lambda v: _finite(v) and 0 <= v < 1),
     "surface_hinges": _whole(0),
     "iterations": _whole(1),
     "variational_updates": _whole(1),
@@ -78,6 +79,8 @@ class MapConfig:
         box_trim: share of an object's points left out of its box at each end of each
             axis. Flying pixels at depth edges otherwise stretch boxes, and with them the
             lattice and the negative samples, by several times (the paper: 0).
+        stray_share: object points with fewer neighbours than this share of the object's
+            median are flying pixels and not learned from (the paper: 0, keep all).
         hinge_depth: nodes deeper than this under the plane are dropped, m; None keeps all.
         surface_hinges: random surface points taken as hinges, per object.
         max_hinges: refuse to build more (memory and time grow with the cube).
@@ -119,6 +122,7 @@ class MapConfig:
     hinge_margin: float = 0.08
     hinge_depth: float | None = 0.05
     box_trim: float = 0.01
+    stray_share: float = 0.03
     surface_hinges: int = 48
     max_hinges: int = 6000
     iterations: int = 6
@@ -174,6 +178,7 @@ class MapConfig:
             hinge_margin=0.0,
             hinge_depth=None,
             box_trim=0.0,
+            stray_share=0.0,
             surface_hinges=32,
             iterations=3,
             variational_updates=1,

@@ -16,6 +16,7 @@ from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hi
 from vprism_plan.mapping.hinge_points import lattice_hinges, surface_hinges
 from vprism_plan.mapping.posterior import VPrismMap
 from vprism_plan.mapping.priors import expand_prior, weight_prior
+from vprism_plan.mapping.strays import stray_points
 from vprism_plan.mapping.subsampling import grid_subsample
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
@@ -135,7 +136,10 @@ def training_data(
     )  # fmt: skip
     near = _near_any(np.concatenate(empty), centers, config.object_radius)
     free = np.concatenate([grid_subsample(near, config.empty_resolution), *front])
-    surfaces = [grid_subsample(points[labels == i], config.object_resolution) for i in object_ids]
+    surfaces = [
+        grid_subsample(_solid(points[labels == i], config.stray_share), config.object_resolution)
+        for i in object_ids
+    ]
     counts = [len(s) for s in surfaces]
     room = max(config.max_points - sum(counts), 1)
     if len(free) > room:
@@ -151,6 +155,14 @@ def training_data(
         surface,
         np.asarray(object_ids, np.int64)[index],
     )
+
+
+def _solid(points: Float[np.ndarray, "n 3"], share: float) -> Float[np.ndarray, "m 3"]:
+    """Return an object's points without flying pixels."""
+    stray = stray_points(points, share)
+    if stray.any():
+        logger.info("%d of %d points of an object taken for flying pixels", stray.sum(), len(stray))
+    return points[~stray]
 
 
 def new_hinges(
