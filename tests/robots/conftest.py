@@ -2,6 +2,7 @@
 from pathlib import Path
 
 import pytest
+from small_urdfs import TWO
 
 from vprism_plan.robots import Robot
 
@@ -41,3 +42,18 @@ def gripper(tmp_path_factory) -> Robot:
     path = tmp_path_factory.mktemp("gripper") / "gripper.urdf"
     path.write_text(GRIPPER)
     return Robot.from_urdf(path, spheres=GRIPPER_SPHERES)
+
+
+@pytest.fixture
+def write(tmp_path):
+    def to(text: str, name: str = "arm.urdf"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return to
+
+
+@pytest.fixture
+def arm(write) -> Robot:
+    return Robot.from_urdf(write(TWO))
