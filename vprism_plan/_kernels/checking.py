@@ -108,13 +108,46 @@ def _transform(T, f, rf, o, out, row):
     out[row, 2] = T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]
 
 
+@njit(cache=True, nogil=True)
+def _cell_bound(D, h, cx, cy, cz):
+    """Best of both rules of `field_bound` over the eight nodes around grid point c."""
+    i0 = min(int(cx), D.shape[0] - 2)
+    j0 = min(int(cy), D.shape[1] - 2)
+    k0 = min(int(cz), D.shape[2] - 2)
+    fx = cx - i0
+    fy = cy - j0
+    fz = cz - k0
+    cone = -_INF
+    square = -(h * h) * (fx * (1.0 - fx) + fy * (1.0 - fy) + fz * (1.0 - fz))
+    for a in range(2):
+        wa = fx if a else 1.0 - fx
+        ea = (fx - a) ** 2
+        for b in range(2):
+            wb = wa * (fy if b else 1.0 - fy)
+            eb = ea + (fy - b) ** 2
+            for c in range(2):
+                d = D[i0 + a, j0 + b, k0 + c]
+                cone = max(cone, d - h * np.sqrt(eb + (fz - c) ** 2))
+                d = min(max(d, 0.0), 1e9)  # no obstacle at all is an infinite distance
+                square += wb * (fz if c else 1.0 - fz) * d * d
+    if square > 0.0:
+        cone = max(cone, np.sqrt(square))
+    return cone
+
+
 @njit(cache=True, nogil=True, inline="always")
 def field_bound(D, wf, x, y, z, enough):
     """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
 
-    Distance is 1-Lipschitz, so every node gives d_i - |x - x_i|; the best of the cell's
-    eight is returned. The nearest node is tried first: a bound above `enough` ends
-    the search, which is the common case.
+    Two rules, both proofs from distances d_i at the nodes x_i of the cell; the larger
+    counts. The nearest node is asked first, and the others only if it gives no more
+    than `enough`: -inf asks it alone, which is what bounding spheres do.
+
+    Cones: distance is 1-Lipschitz, so d(x) >= d_i - |x - x_i|.
+
+    Parabolas: d(x)^2 - |x|^2 is concave (a minimum of linear functions of x), so with
+    trilinear weights w_i and cell fractions f_a, where d_i >= 0,
+    d(x)^2 >= sum_i w_i d_i^2 - h^2 sum_a f_a (1 - f_a).
 
     Outside the grid, with c the closest point of the grid box, every obstacle o of the
     grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex.
@@ -130,31 +163,23 @@ def field_bound(D, wf, x, y, z, enough):
     cy = min(max(gy, 0.0), ny - 1.0)
     cz = min(max(gz, 0.0), nz - 1.0)
     out2 = (gx - cx) ** 2 + (gy - cy) ** 2 + (gz - cz) ** 2
-    if not (out2 < 1e18):
-        return -_INF  # not finite, or absurdly far: never "free"
-    if out2 > 0.0 and wf[4] > 0.0:
-        return -h * np.sqrt(out2)
-    i = int(cx + 0.5)
-    j = int(cy + 0.5)
-    k = int(cz + 0.5)
-    best = D[i, j, k] - h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
-    if best <= enough or out2 > 0.0:
-        i0 = min(int(cx), nx - 2)
-        j0 = min(int(cy), ny - 2)
-        k0 = min(int(cz), nz - 2)
-        for a in range(2):
-            ex = (cx - i0 - a) ** 2
-            for b in range(2):
-                ey = ex + (cy - j0 - b) ** 2
-                for c in range(2):
-                    d = D[i0 + a, j0 + b, k0 + c] - h * np.sqrt(ey + (cz - k0 - c) ** 2)
-                    best = max(best, d)
-    if out2 > 0.0:
-        inside = max(best, 0.0)
-        best = np.sqrt(out2 * h * h + inside * inside)
-    elif wf[4] > 0.0:
-        faces = min(gx, nx - 1.0 - gx, gy, ny - 1.0 - gy)
-        best = min(best, h * min(faces, gz, nz - 1.0 - gz))
+    best = -_INF  # not finite, or absurdly far: never "free"
+    if out2 < 1e18:
+        if out2 > 0.0 and wf[4] > 0.0:
+            best = -h * np.sqrt(out2)
+        else:
+            i = int(cx + 0.5)
+            j = int(cy + 0.5)
+            k = int(cz + 0.5)
+            best = D[i, j, k] - h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
+            if best <= enough:
+                best = max(best, _cell_bound(D, h, cx, cy, cz))
+            if out2 > 0.0:
+                inside = max(best, 0.0)
+                best = np.sqrt(out2 * h * h + inside * inside)
+            elif wf[4] > 0.0:
+                faces = min(gx, nx - 1.0 - gx, gy, ny - 1.0 - gy)
+                best = min(best, h * min(faces, gz, nz - 1.0 - gz))
     return best
 
 
@@ -207,11 +232,11 @@ def _world_clear(T, lc, C, placed, rf, ri, D, wf):
         y = lc[link, 1]
         z = lc[link, 2]
         plane_ok = plane_bound(wf, x, y, z) > need
-        field_ok = field_bound(D, wf, x, y, z, need) > need
+        field_ok = field_bound(D, wf, x, y, z, -_INF) > need
         if plane_ok and field_ok:
             continue
-        if not placed[link]:
-            placed[link] = True
+        if placed[link] == 0.0:
+            placed[link] = 1.0
             _place_link(link, T, rf, ri, C)
         for s in range(ri[li + 1], ri[li + 2]):
             x = C[0, s]
@@ -237,11 +262,11 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, enough):
     y = lc[link, 1]
     z = lc[link, 2]
     plane_all = plane_bound(wf, x, y, z) - r
-    field_all = field_bound(D, wf, x, y, z, _INF) - r
+    field_all = field_bound(D, wf, x, y, z, -_INF) - r
     if min(plane_all, field_all) >= enough:
         return min(plane_all, field_all)
-    if not placed[link]:
-        placed[link] = True
+    if placed[link] == 0.0:
+        placed[link] = 1.0
         _place_link(link, T, rf, ri, C)
     best = _INF
     li = ri[9] + 4 * link
@@ -260,11 +285,11 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, enough):
 @njit(cache=True, nogil=True)
 def _place_pair(a, b, T, C, placed, rf, ri):
     """Make sure that the spheres of both links are placed."""
-    if not placed[a]:
-        placed[a] = True
+    if placed[a] == 0.0:
+        placed[a] = 1.0
         _place_link(a, T, rf, ri, C)
-    if not placed[b]:
-        placed[b] = True
+    if placed[b] == 0.0:
+        placed[b] = 1.0
         _place_link(b, T, rf, ri, C)
 
 
@@ -341,12 +366,20 @@ def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _scratch(ri):
-    """Room for frame poses, link centres, sphere centres and which links are placed."""
-    n_links = ri[2]
-    C = np.empty((3, ri[1]))
-    return np.empty((ri[0], 12)), np.empty((n_links, 3)), C, np.empty(n_links, np.bool_)
+    """Room for frame poses, link centres, sphere centres and which links are placed.
+
+    One allocation: four would cost a tenth of a state check.
+    """
+    a = 12 * ri[0]
+    b = a + 3 * ri[2]
+    c = b + 3 * ri[1]
+    block = np.empty(c + ri[2])
+    T = block[:a].reshape(ri[0], 12)
+    lc = block[a:b].reshape(ri[2], 3)
+    C = block[b:c].reshape(3, ri[1])
+    return T, lc, C, block[c:]
 
 
 @njit(cache=True, nogil=True)
@@ -354,7 +387,7 @@ def _pose(q, rf, ri, T, lc, placed):
     """Place frames and link bounding spheres; no sphere is placed yet."""
     fk_frames(q, rf, ri, T)
     for link in range(ri[2]):
-        placed[link] = False
+        placed[link] = 0.0
         _transform(T, ri[ri[9] + 4 * link], rf, ri[18] + 4 * link, lc, link)
 
 

@@ -59,6 +59,7 @@ class CollisionChecker:
         self._rf, self._ri = packed.floats, packed.ints
         self._D, self._wf = baked.distance, baked.floats
         self._dof = robot.dof
+        self._shape = (robot.dof,)
 
     def is_valid(self, q: Numbers) -> bool:
         """Return whether a configuration is free.
@@ -102,7 +103,12 @@ class CollisionChecker:
         Raises:
             RobotError: q does not have shape (dof,) or is not finite.
         """
-        return float(self.clearance_batch(self._configuration(q)[None])[0])
+        q = self._configuration(q)
+        if not np.isfinite(q).all():
+            raise RobotError(f"configuration is {q.tolist()}; clearance needs finite joint values")
+        world, own = np.empty(1), np.empty(1)
+        kernels.clearance_batch(q[None], self._rf, self._ri, self._D, self._wf, world, own)
+        return float(world[0])
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return `clearance` for each row of Q (n, dof), metres."""
@@ -207,7 +213,7 @@ class CollisionChecker:
 
     def _configuration(self, q: Numbers) -> Float[np.ndarray, "dof"]:
         array = np.ascontiguousarray(q, dtype=np.float64)
-        if array.shape != (self._dof,):
+        if array.shape != self._shape:
             raise RobotError(
                 f"configuration has shape {array.shape}; {self.robot.name} needs ({self._dof},): "
                 f"{', '.join(self.robot.joint_names)}"

@@ -18,10 +18,25 @@ Numbers = ArrayLike | Sequence[Any]
 class NodeField(Protocol):
     """Distances on a grid of nodes; see `vprism_plan.world.DistanceField`."""
 
-    origin: np.ndarray
-    spacing: float
-    distance: np.ndarray
-    source: np.ndarray
+    @property
+    def origin(self) -> np.ndarray:
+        """World position of node (0, 0, 0), metres."""
+        ...
+
+    @property
+    def spacing(self) -> float:
+        """Distance between nodes, metres."""
+        ...
+
+    @property
+    def distance(self) -> np.ndarray:
+        """Lower bound of the signed distance at every node, metres."""
+        ...
+
+    @property
+    def source(self) -> np.ndarray:
+        """Index of the nearest obstacle's name at every node."""
+        ...
 
 
 @runtime_checkable
