@@ -57,10 +57,17 @@ def test_it_is_frozen():
         MapConfig().gamma = 2.0
 
 
-def test_the_default_lattice_leaves_little_trace():
-    config = MapConfig()
-    assert config.hinge_spacing <= 2.0 * config.kernel_length
-    assert config.surface_hinges >= 32
+def test_the_fine_lattice_leaves_next_to_no_trace():
+    """The prior logit variance at a node and at a cell centre differ by a few percent."""
+    config = MapConfig.fine()
+    assert config.hinge_spacing <= 1.3 * config.kernel_length
+    assert MapConfig().surface_hinges >= 32
+    axis = config.hinge_spacing * np.arange(-8, 9)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5]]) * config.hinge_spacing
+    square = ((points[:, None] - nodes[None]) ** 2).sum(2)
+    at_node, at_centre = (np.exp(-config.gamma * square) ** 2).sum(1)
+    assert at_centre == pytest.approx(at_node, rel=0.04)
 
 
 @pytest.mark.parametrize("spacing", [0.02, 0.03, 0.04, 0.05])

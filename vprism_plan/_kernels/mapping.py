@@ -116,8 +116,7 @@ def _make_gram_products(classes):
             whole = first.type
             double = ir.DoubleType()
             weights = [
-                _load_parts(builder, scaled, ir.Constant(whole, k * BLOCK))
-                for k in range(classes)
+                _load_parts(builder, scaled, ir.Constant(whole, k * BLOCK)) for k in range(classes)
             ]
             add_all = cgutils.get_or_insert_function(
                 builder.module,

@@ -194,6 +194,15 @@ class MapConfig:
             front_distance=None,
         )
 
+    @classmethod
+    def fine(cls) -> "MapConfig":
+        """Return the default with a lattice that leaves no trace in the variance.
+
+        Its spacing is 1.25 kernel lengths; take it where probabilities matter more than
+        fitting time (about four times the default's).
+        """
+        return cls(hinge_spacing=0.028)
+
     @property
     def kernel_length(self) -> float:
         """Length scale of the kernel, m: 1 / sqrt(2 gamma)."""
