@@ -45,10 +45,12 @@ def run_demo(output: Path, seed: int, console: "Console") -> int:
     checker = CollisionChecker(world, robot, CheckerConfig(margin=MARGIN))
     with console.stage("place"):
         # Left of the arm is the camera's side: it starts where everything is seen.
-        ends = choose_ends(checker, around, np.random.default_rng(seed))
+        ends = choose_ends(checker, robot, around, np.random.default_rng(seed))
     if ends is None:
         raise PlanningError(f"seed {seed} finds no start and goal for the demo; try another seed")
-    situation = Situation(checker, ends[1], ends[0], ("start", "goal"), title="vprism-plan demo")
+    situation = Situation(
+        checker, robot, ends[1], ends[0], ("start", "goal"), title="vprism-plan demo"
+    )
     truth = load_ground_truth(folder)
     return solve(
         replace(situation, truth=truth.signed_distance),

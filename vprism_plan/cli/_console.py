@@ -60,7 +60,7 @@ class Console:
 
         clock = _CompileClock(self)
 
-        class Listener(event.Listener):  # type: ignore[misc]
+        class Listener(event.Listener):
             def on_start(self, event: Any) -> None:
                 clock.start(event)
 

@@ -2,7 +2,7 @@
 """Commands about a robot in a map: `plan` and `query`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,18 +24,6 @@ if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
     from vprism_plan.robots import Robot
     from vprism_plan.world import World
-
-
-class _Setup(Protocol):
-    """What `plan` and `query` have in common."""
-
-    robot: Path
-    base_xyz: tuple[float, float, float] | None
-    base_yaw: float | None
-    margin: float
-    occluded: Any
-    unobserved: Any
-    seed: int
 
 
 class NoPlaceError(Exception):
@@ -140,7 +128,7 @@ def _map_from(path: Path, frame: int | None, seed: int, console: Console) -> "VP
         return load_map(path)
 
 
-def _bake(m: "VPrismMap", command: _Setup, console: Console) -> "World":
+def _bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
     from vprism_plan.world import World, WorldConfig
 
     config = WorldConfig(occluded=command.occluded, unobserved=command.unobserved)
@@ -187,7 +175,9 @@ def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
     return matrix
 
 
-def _standing(command: _Setup, robot: "Robot", world: "World", around: Surroundings) -> "Robot":
+def _standing(
+    command: Plan | Query, robot: "Robot", world: "World", around: Surroundings
+) -> "Robot":
     """Return the robot on the base that was given, else on the first free place."""
     if command.base_xyz is not None:
         return robot.with_base_pose(base_pose(np.array(command.base_xyz), around, command.base_yaw))
@@ -220,6 +210,7 @@ def _place(command: Plan, robot: "Robot", world: "World") -> Situation:
         rng = np.random.default_rng([command.seed, number])
         ends = choose_ends(
             checker,
+            placed,
             around,
             rng,
             start=command.start,
@@ -235,7 +226,7 @@ def _place(command: Plan, robot: "Robot", world: "World") -> Situation:
                 )
                 if given is None
             ]
-            return Situation(checker, *ends, tuple(chosen))
+            return Situation(checker, placed, *ends, tuple(chosen))
     where = "from the given base" if command.base_xyz is not None else "from any base beside them"
     raise NoPlaceError(
         f"the hand has no valid configuration on both sides of the objects {where}; "
@@ -245,6 +236,7 @@ def _place(command: Plan, robot: "Robot", world: "World") -> Situation:
 
 def choose_ends(
     checker: "CollisionChecker",
+    robot: "Robot",
     around: Surroundings,
     rng: np.random.Generator,
     *,
@@ -258,7 +250,6 @@ def choose_ends(
     """
     from vprism_plan.viz import hand_path
 
-    robot = checker.robot
     sides = around.sides(robot.base_pose[:3, 3])
     left = sides[1] - sides[0]
     left = left / np.linalg.norm(left)
@@ -272,14 +263,14 @@ def choose_ends(
         edge = around.half_width(left[:2])
         target = sides[1 if sign > 0 else 0]
         return reach_for(
-            checker, target, lambda hand: sign * ((hand - middle) @ left) > edge, like, rng
+            checker, robot, target, lambda hand: sign * ((hand - middle) @ left) > edge, like, rng
         )
 
     first = None if start is None else np.asarray(start, dtype=np.float64)
     last = None if goal is None else np.asarray(goal, dtype=np.float64)
     if first is None:
-        known = last is not None and last.ndim == 1
-        first = reach(-1.0 if last is None else -side_of(last), last if known else robot.neutral)
+        like = robot.neutral if last is None or last.ndim != 1 else last
+        first = reach(-1.0 if last is None else -side_of(last), like)
     if first is not None and last is None:
         last = reach(-side_of(first), first)
     return None if first is None or last is None else (first, last)

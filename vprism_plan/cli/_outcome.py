@@ -16,6 +16,7 @@ from vprism_plan.cli._staging import PLAN_FILES, staged
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
     from vprism_plan.planning import PlanResult
+    from vprism_plan.robots import Robot
 
 _PROFILE = 64  # clearances along the path in the report
 
@@ -29,6 +30,7 @@ class Situation:
     """
 
     checker: "CollisionChecker"
+    robot: "Robot"
     start: np.ndarray
     goal: np.ndarray
     chosen: tuple[str, ...] = ()
@@ -50,7 +52,7 @@ def report_plan(situation: Situation, result: "PlanResult", output: Path, consol
             payload["trajectory"] = _write_trajectory(situation, result, aside)
             payload["clearance"] = clearance_profile(situation.checker, result.path)
             if situation.truth is not None:
-                payload["truth"] = true_distance(situation.checker, result.path, situation.truth)
+                payload["truth"] = true_distance(situation.robot, result.path, situation.truth)
         payload["sizes"] = {
             str(p.relative_to(aside)): p.stat().st_size
             for p in sorted(aside.rglob("*"))
@@ -67,7 +69,7 @@ def _payload(
     situation: Situation, result: "PlanResult", meshes: dict[int, Any], console: Console
 ) -> dict[str, Any]:
     checker = situation.checker
-    robot, world = checker.robot, checker.world
+    robot, world = situation.robot, checker.world
     explanation = result.explanation
     return {
         "solved": result.solved,
@@ -99,7 +101,7 @@ def _payload(
 def _write_trajectory(situation: Situation, result: "PlanResult", aside: Path) -> dict[str, Any]:
     from vprism_plan.planning import time_parameterize, write_trajectory
 
-    robot = situation.checker.robot
+    robot = situation.robot
     assert result.path is not None
     trajectory = time_parameterize(robot, result.path)
     write_trajectory(aside / "trajectory.json", robot, trajectory, frame_id="world")
@@ -129,7 +131,7 @@ def clearance_profile(checker: "CollisionChecker", path: np.ndarray) -> dict[str
 
 
 def true_distance(
-    checker: "CollisionChecker", path: np.ndarray, truth: Callable[[np.ndarray], np.ndarray]
+    robot: "Robot", path: np.ndarray, truth: Callable[[np.ndarray], np.ndarray]
 ) -> dict[str, Any]:
     """Return the smallest distance of the moving spheres to the real objects, metres.
 
@@ -137,7 +139,6 @@ def true_distance(
     """
     from vprism_plan.viz import sphere_centers
 
-    robot = checker.robot
     moving = ~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
     dense = dense_path(path, 0.0015)
     best, at, largest_step = np.inf, (0, 0), 0.0
@@ -167,8 +168,7 @@ def true_distance(
 def _draw(situation: Situation, result: "PlanResult", meshes: dict[int, Any], aside: Path) -> None:
     from vprism_plan.viz import map_figure, plan_figure, save_figure, scene_figure
 
-    checker = situation.checker
-    m = checker.world.map
+    m = situation.checker.world.map
     view = m.views[0]
     title = situation.title or None
     save_figure(scene_figure(view, title=title), aside / "scene.png")
@@ -178,7 +178,7 @@ def _draw(situation: Situation, result: "PlanResult", meshes: dict[int, Any], as
         return
     figure = plan_figure(
         meshes,
-        checker.robot,
+        situation.robot,
         path,
         table_height=float(m.plane.offset / m.plane.normal[2]),
         title=title,
@@ -223,6 +223,12 @@ def _lines(
                 f"({payload['truth']['link']}; sampled every "
                 f"{1000 * payload['truth']['largest_motion_between_samples']:.1f} mm or less)"
             )
+        share = sum(report.shares.get(kind, 0.0) for kind in ("unobserved", "outside"))
+        lines.append(
+            f"unseen: up to {100 * share:.0f} % of the arm is where no camera looked, which counts "
+            f"as {payload['world']['unobserved']}; hidden space counts as "
+            f"{payload['world']['occluded']}"
+        )
         lines.append(f"trajectory: {payload['trajectory']['duration']:.1f} s")
     else:
         lines.append(f"no safe answer ({result.status}): {result.message}")

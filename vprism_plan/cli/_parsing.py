@@ -6,7 +6,6 @@ import io
 import os
 import re
 from collections.abc import Iterator, Sequence
-from typing import cast
 
 from vprism_plan.cli._commands import Command, CommandLine
 
@@ -39,8 +38,8 @@ def parse(arguments: Sequence[str]) -> Command:
             stack.enter_context(_wide_terminal())
             stack.enter_context(contextlib.redirect_stderr(noise))
         try:
-            command = tyro.cli(
-                CommandLine,  # type: ignore[arg-type]
+            command: Command = tyro.cli(
+                CommandLine,
                 prog=PROGRAM,
                 description=_DESCRIPTION,
                 args=list(arguments),
@@ -50,7 +49,7 @@ def parse(arguments: Sequence[str]) -> Command:
             if not stop.code:
                 raise
             raise UsageError(_one_line(noise.getvalue())) from None
-    return cast(Command, command)
+    return command
 
 
 def _one_line(box: str) -> str:

@@ -110,6 +110,7 @@ def candidate_bases(robot: "Robot", around: Surroundings) -> Iterator[Float[np.n
 
 def reach_for(
     checker: "CollisionChecker",
+    robot: "Robot",
     target: Float[np.ndarray, "3"],
     beyond: Callable[[np.ndarray], np.ndarray],
     like: Float[np.ndarray, "dof"],
@@ -122,7 +123,6 @@ def reach_for(
     """
     from vprism_plan.viz import hand_path
 
-    robot = checker.robot
     span = robot.upper - robot.lower
     best = np.asarray(like)[None]
     found, score, near = None, np.inf, False
