@@ -156,7 +156,7 @@ class VPrismMap:
         def chunk(piece: slice) -> None:
             kernels.normalised_log_odds(mean, variance, piece.start, piece.stop, MAX_LOG_ODDS, out)
 
-        run_chunked(chunk, len(out), 16384)
+        run_chunked(chunk, len(out), 4096)
         return out
 
     def sample_weights(self, n: int, seed: int) -> Float[np.ndarray, "n m k"]:
@@ -225,7 +225,7 @@ class VPrismMap:
                 space.row_first, space.base, mean, variance, support,
             )  # fmt: skip
 
-        run_chunked(chunk, len(block_start) - 1, 512)
+        run_chunked(chunk, len(block_start) - 1, 64)
         return mean, variance, support
 
     def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
@@ -235,7 +235,7 @@ class VPrismMap:
         def chunk(piece: slice) -> None:
             kernels.normalised_log_probabilities(mean, variance, piece.start, piece.stop, out)
 
-        run_chunked(chunk, len(out), 16384)
+        run_chunked(chunk, len(out), 4096)
         return out
 
     def _torch_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
