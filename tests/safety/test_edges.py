@@ -58,8 +58,8 @@ def test_two_thousand_accepted_edges_touch_nothing(checker, level_set):
         assert report.tolerance <= checker.config.tolerance
         steps = max(2, int(np.ceil(report.motion_bound / STEP)) + 1)
         path = qa + np.linspace(0.0, 1.0, steps)[:, None] * (qb - qa)
-        # Elsewhere the field itself proves the configuration free (tested on its own).
-        for q in path[checker.clearance_batch(path) <= 0.0]:
+        # Farther off, the field itself proves the configuration free (tested on its own).
+        for q in path[checker.clearance_batch(path) <= 0.004]:
             centers = checker.sphere_clearances(q)[0][moving]
             gaps = level_set.query(centers)[0] - radii
             assert gaps.min() > -report.tolerance - 1e-9

@@ -18,6 +18,7 @@ Frame 0 is the base; every other frame moves about or along its own z axis.
 world floats `wf` = origin x, y, z, spacing, outside_occupied, n_planes, margin, then
     four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset).
 distance field `D` (nx, ny, nz) float32: lower bounds of the signed distance at nodes.
+block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 x 4 cells.
 """
 
 import numpy as np
@@ -26,7 +27,7 @@ from numba import njit
 _INF = np.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def fk_frames(q, rf, ri, T):
     """Fill T (n_frames, 12) with the world pose of every frame: R row-major, then t."""
     n_frames = ri[0]
@@ -110,7 +111,16 @@ def _transform(T, f, rf, o, out, row):
 
 @njit(cache=True, nogil=True)
 def _cell_bound(D, h, cx, cy, cz):
-    """Best of both rules of `field_bound` over the eight nodes around grid point c."""
+    """Lower bound of the distance at grid point c from the eight nodes around it, metres.
+
+    Two rules, both proofs from distances d_i at the nodes x_i; the larger counts.
+
+    Cones: distance is 1-Lipschitz, so d(x) >= d_i - |x - x_i|.
+
+    Parabolas: d(x)^2 - |x|^2 is concave (a minimum of linear functions of x), so with
+    trilinear weights w_i and cell fractions f_a, where d_i >= 0,
+    d(x)^2 >= sum_i w_i d_i^2 - h^2 sum_a f_a (1 - f_a).
+    """
     i0 = min(int(cx), D.shape[0] - 2)
     j0 = min(int(cy), D.shape[1] - 2)
     k0 = min(int(cz), D.shape[2] - 2)
@@ -136,18 +146,14 @@ def _cell_bound(D, h, cx, cy, cz):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def field_bound(D, wf, x, y, z, enough):
+def field_bound(D, E, wf, x, y, z, enough, deep):
     """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
 
-    Two rules, both proofs from distances d_i at the nodes x_i of the cell; the larger
-    counts. The nearest node is asked first, and the others only if it gives no more
-    than `enough`: -inf asks it alone, which is what bounding spheres do.
-
-    Cones: distance is 1-Lipschitz, so d(x) >= d_i - |x - x_i|.
-
-    Parabolas: d(x)^2 - |x|^2 is concave (a minimum of linear functions of x), so with
-    trilinear weights w_i and cell fractions f_a, where d_i >= 0,
-    d(x)^2 >= sum_i w_i d_i^2 - h^2 sum_a f_a (1 - f_a).
+    Asked in this order until a bound exceeds `enough`; each is never below the one
+    before, so verdicts do not depend on where it ends:
+    the block (one number for 4 x 4 x 4 cells; a table that stays in the cache),
+    the nearest node (its distance less the way to it),
+    and, if `deep`, the best of the cell's eight nodes (`_cell_bound`).
 
     Outside the grid, with c the closest point of the grid box, every obstacle o of the
     grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex.
@@ -168,12 +174,14 @@ def field_bound(D, wf, x, y, z, enough):
         if out2 > 0.0 and wf[4] > 0.0:
             best = -h * np.sqrt(out2)
         else:
-            i = int(cx + 0.5)
-            j = int(cy + 0.5)
-            k = int(cz + 0.5)
-            best = D[i, j, k] - h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
+            best = float(E[int(cx) >> 2, int(cy) >> 2, int(cz) >> 2])
             if best <= enough:
-                best = max(best, _cell_bound(D, h, cx, cy, cz))
+                i = int(cx + 0.5)
+                j = int(cy + 0.5)
+                k = int(cz + 0.5)
+                best = D[i, j, k] - h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
+                if deep and best <= enough:
+                    best = max(best, _cell_bound(D, h, cx, cy, cz))
             if out2 > 0.0:
                 inside = max(best, 0.0)
                 best = np.sqrt(out2 * h * h + inside * inside)
@@ -193,12 +201,6 @@ def plane_bound(wf, x, y, z):
     return best
 
 
-@njit(cache=True, nogil=True)
-def world_bound(D, wf, x, y, z, enough):
-    """Lower bound of the distance from a point to everything in the world."""
-    return min(plane_bound(wf, x, y, z), field_bound(D, wf, x, y, z, enough))
-
-
 @njit(cache=True, nogil=True, inline="always")
 def within_limits(q, rf, ri):
     """Whether every joint is finite and, unless continuous, inside its limits."""
@@ -213,8 +215,8 @@ def within_limits(q, rf, ri):
     return True
 
 
-@njit(cache=True, nogil=True)
-def _world_clear(T, lc, C, placed, rf, ri, D, wf):
+@njit(cache=True, nogil=True, inline="always")
+def _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
     """Whether every moving link keeps more than the margin from the world.
 
     Bounding spheres first; one loop without calls, since each call would pass (and
@@ -232,11 +234,11 @@ def _world_clear(T, lc, C, placed, rf, ri, D, wf):
         y = lc[link, 1]
         z = lc[link, 2]
         plane_ok = plane_bound(wf, x, y, z) > need
-        field_ok = field_bound(D, wf, x, y, z, -_INF) > need
+        field_ok = field_bound(D, E, wf, x, y, z, need, False) > need
         if plane_ok and field_ok:
             continue
-        if placed[link] == 0.0:
-            placed[link] = 1.0
+        if not placed[link]:
+            placed[link] = True
             _place_link(link, T, rf, ri, C)
         for s in range(ri[li + 1], ri[li + 2]):
             x = C[0, s]
@@ -245,13 +247,13 @@ def _world_clear(T, lc, C, placed, rf, ri, D, wf):
             need = margin + rf[ro + s]
             if not plane_ok and not plane_bound(wf, x, y, z) > need:
                 return False
-            if not field_ok and not field_bound(D, wf, x, y, z, need) > need:
+            if not field_ok and not field_bound(D, E, wf, x, y, z, need, True) > need:
                 return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, enough):
+def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, enough):
     """Lower bound of the distance from a link to the world, exact per sphere below `enough`.
 
     A sphere is never nearer than the link's bounding sphere, so each bound is the
@@ -262,11 +264,11 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, enough):
     y = lc[link, 1]
     z = lc[link, 2]
     plane_all = plane_bound(wf, x, y, z) - r
-    field_all = field_bound(D, wf, x, y, z, -_INF) - r
+    field_all = field_bound(D, E, wf, x, y, z, _INF, False) - r
     if min(plane_all, field_all) >= enough:
         return min(plane_all, field_all)
-    if placed[link] == 0.0:
-        placed[link] = 1.0
+    if not placed[link]:
+        placed[link] = True
         _place_link(link, T, rf, ri, C)
     best = _INF
     li = ri[9] + 4 * link
@@ -277,23 +279,23 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, enough):
         z = C[2, s]
         r = rf[ro + s]
         plane = max(plane_bound(wf, x, y, z) - r, plane_all)
-        field = max(field_bound(D, wf, x, y, z, _INF) - r, field_all)
+        field = max(field_bound(D, E, wf, x, y, z, _INF, True) - r, field_all)
         best = min(best, plane, field)
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _place_pair(a, b, T, C, placed, rf, ri):
     """Make sure that the spheres of both links are placed."""
-    if placed[a] == 0.0:
-        placed[a] = 1.0
+    if not placed[a]:
+        placed[a] = True
         _place_link(a, T, rf, ri, C)
-    if placed[b] == 0.0:
-        placed[b] = 1.0
+    if not placed[b]:
+        placed[b] = True
         _place_link(b, T, rf, ri, C)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _self_clear(T, lc, C, placed, rf, ri):
     """Whether every pair of links keeps more than the self margin; bounding spheres first."""
     margin = rf[ri[21]]
@@ -321,13 +323,11 @@ def _self_clear(T, lc, C, placed, rf, ri):
             if (px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2 > bound * bound:
                 continue
             ra = rf[ro + s] + margin
-            touching = False
-            for t in range(b0, b1):  # no early exit: this loop vectorises
+            for t in range(b0, b1):
                 d2 = (px - C[0, t]) ** 2 + (py - C[1, t]) ** 2 + (pz - C[2, t]) ** 2
                 bound = ra + rf[ro + t]
-                touching |= d2 <= bound * bound
-            if touching:
-                return False
+                if d2 <= bound * bound:
+                    return False
     return True
 
 
@@ -370,54 +370,49 @@ def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
 def _scratch(ri):
     """Room for frame poses, link centres, sphere centres and which links are placed.
 
-    One allocation: four would cost a tenth of a state check.
+    Four allocations: views of one would keep the loops from vectorising.
     """
-    a = 12 * ri[0]
-    b = a + 3 * ri[2]
-    c = b + 3 * ri[1]
-    block = np.empty(c + ri[2])
-    T = block[:a].reshape(ri[0], 12)
-    lc = block[a:b].reshape(ri[2], 3)
-    C = block[b:c].reshape(3, ri[1])
-    return T, lc, C, block[c:]
+    n_links = ri[2]
+    C = np.empty((3, ri[1]))
+    return np.empty((ri[0], 12)), np.empty((n_links, 3)), C, np.empty(n_links, np.bool_)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _pose(q, rf, ri, T, lc, placed):
     """Place frames and link bounding spheres; no sphere is placed yet."""
     fk_frames(q, rf, ri, T)
     for link in range(ri[2]):
-        placed[link] = 0.0
+        placed[link] = False
         _transform(T, ri[ri[9] + 4 * link], rf, ri[18] + 4 * link, lc, link)
 
 
-@njit(cache=True, nogil=True)
-def _state_valid(q, rf, ri, D, wf, T, lc, C, placed):
+@njit(cache=True, nogil=True, inline="always")
+def _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed):
     if not within_limits(q, rf, ri):
         return False
     _pose(q, rf, ri, T, lc, placed)
-    if not _world_clear(T, lc, C, placed, rf, ri, D, wf):
+    if not _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
         return False
     return _self_clear(T, lc, C, placed, rf, ri)
 
 
 @njit(cache=True, nogil=True)
-def is_valid(q, rf, ri, D, wf):
+def is_valid(q, rf, ri, D, E, wf):
     """Whether a configuration is inside its limits and clear of the world and itself."""
     T, lc, C, placed = _scratch(ri)
-    return _state_valid(q, rf, ri, D, wf, T, lc, C, placed)
+    return _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed)
 
 
 @njit(cache=True, nogil=True)
-def is_valid_batch(Q, rf, ri, D, wf, out):
+def is_valid_batch(Q, rf, ri, D, E, wf, out):
     """Fill out (n,) with `is_valid` of each row of Q (n, dof)."""
     T, lc, C, placed = _scratch(ri)
     for n in range(Q.shape[0]):
-        out[n] = _state_valid(Q[n], rf, ri, D, wf, T, lc, C, placed)
+        out[n] = _state_valid(Q[n], rf, ri, D, E, wf, T, lc, C, placed)
 
 
 @njit(cache=True, nogil=True)
-def clearance_batch(Q, rf, ri, D, wf, world, own):
+def clearance_batch(Q, rf, ri, D, E, wf, world, own):
     """Fill world (n,) and own (n,): distance bounds to the world and between links, metres."""
     T, lc, C, placed = _scratch(ri)
     li = ri[9]
@@ -426,7 +421,7 @@ def clearance_batch(Q, rf, ri, D, wf, world, own):
         best = _INF
         for link in range(ri[2]):
             if ri[li + 4 * link + 3] == 0:
-                best = min(best, _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, best))
+                best = min(best, _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, best))
         world[n] = best
         gap = _INF
         for pair in range(ri[3]):
@@ -435,7 +430,7 @@ def clearance_batch(Q, rf, ri, D, wf, world, own):
 
 
 @njit(cache=True, nogil=True)
-def sphere_clearances(q, rf, ri, D, wf, C, plane, which, field):
+def sphere_clearances(q, rf, ri, D, E, wf, C, plane, which, field):
     """Per sphere: centre, distance to the nearest plane and its index, bound from the field.
 
     Every sphere's own values (no bounding spheres): what `explain` reports.
@@ -455,7 +450,7 @@ def sphere_clearances(q, rf, ri, D, wf, C, plane, which, field):
             if d < plane[s]:
                 plane[s] = d
                 which[s] = p
-        field[s] = field_bound(D, wf, x, y, z, _INF) - r
+        field[s] = field_bound(D, E, wf, x, y, z, _INF, True) - r
 
 
 @njit(cache=True, nogil=True)
@@ -520,7 +515,7 @@ def motion_rates(delta, rf, ri, link_rate, pair_rate):
 
 
 @njit(cache=True, nogil=True)
-def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, C, placed):
+def _safe_span(q, rf, ri, D, E, wf, link_rate, pair_rate, longest, T, lc, C, placed):
     """How far along the edge (path parameter) a configuration's clearance reaches; < 0: invalid.
 
     Each link may move by its clearance, each pair by its gap, before anything can
@@ -536,7 +531,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, C, placed
         if ri[li + 4 * link + 3] != 0:
             continue
         rate = link_rate[link]
-        c = _link_clearance(link, T, lc, C, placed, rf, ri, D, wf, margin + span * rate) - margin
+        c = _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, margin + span * rate) - margin
         if not c > 0.0:
             return -1.0
         if c < span * rate:
@@ -553,7 +548,7 @@ def _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, longest, T, lc, C, placed
 
 
 @njit(cache=True, nogil=True)
-def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
+def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
     """Whether the straight edge qa -> qb is free, by conservative advancement.
 
     Intervals between checked configurations are covered by what their clearances
@@ -590,12 +585,12 @@ def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
     q = np.empty(dof)
     lo = np.empty(128)
     hi = np.empty(128)
-    span_a = _safe_span(qa, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
+    span_a = _safe_span(qa, rf, ri, D, E, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
     stats[1] = 1.0
     if span_a < 0.0:
         stats[0] = 0.0
         return False
-    span_b = _safe_span(qb, rf, ri, D, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
+    span_b = _safe_span(qb, rf, ri, D, E, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
     stats[1] = 2.0
     if span_b < 0.0:
         stats[0] = 1.0
@@ -614,7 +609,9 @@ def check_motion(qa, qb, rf, ri, D, wf, min_motion, stats):
         t = 0.5 * (a + b)
         for j in range(dof):
             q[j] = qa[j] + t * delta[j]
-        span = _safe_span(q, rf, ri, D, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, C, placed)
+        span = _safe_span(
+            q, rf, ri, D, E, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, C, placed
+        )
         stats[1] += 1.0
         if span < 0.0:
             stats[0] = t

@@ -38,7 +38,8 @@ class CollisionChecker:
     distances are lower bounds, so an error can only refuse. Links that no joint moves
     are not checked against the world: they stand on it.
 
-    Safe to share between threads; the kernels release the GIL. Single queries cost
+    Construction compiles the kernels if they are not cached on disk (some ten seconds,
+    once per machine). Safe to share between threads; the kernels release the GIL. Single queries cost
     about a microsecond of compiled code: O(frames + links), plus O(spheres) for the
     links whose bounding spheres come near something.
 
@@ -57,9 +58,20 @@ class CollisionChecker:
         packed = pack_robot(robot.arrays, self.config.self_margin)
         baked = pack_world(world, self.config.margin)
         self._rf, self._ri = packed.floats, packed.ints
-        self._D, self._wf = baked.distance, baked.floats
+        self._D, self._E, self._wf = baked.distance, baked.blocks, baked.floats
         self._dof = robot.dof
         self._shape = (robot.dof,)
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Ask every kernel once, so that none compiles inside a planner's time limit."""
+        q = np.zeros(self._dof)
+        self.is_valid_batch(q[None])
+        self.is_valid_buffer(q)
+        self.clearance(q)
+        self.check_motion_buffer(q, q)
+        self.sphere_clearances(q)
+        self.pair_gaps(q)
 
     def is_valid(self, q: Numbers) -> bool:
         """Return whether a configuration is free.
@@ -73,14 +85,16 @@ class CollisionChecker:
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        return kernels.is_valid(self._configuration(q), self._rf, self._ri, self._D, self._wf)
+        return kernels.is_valid(
+            self._configuration(q), self._rf, self._ri, self._D, self._E, self._wf
+        )
 
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
         """`is_valid` without looking at the shape: q must be a contiguous float64 (dof,) array.
 
         The path for planners' inner loops.
         """
-        return kernels.is_valid(q, self._rf, self._ri, self._D, self._wf)
+        return kernels.is_valid(q, self._rf, self._ri, self._D, self._E, self._wf)
 
     def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
         """Return `is_valid` for each row of Q (n, dof); runs on all worker threads."""
@@ -88,7 +102,9 @@ class CollisionChecker:
         out = np.empty(len(Q), dtype=np.bool_)
 
         def work(part: slice) -> None:
-            kernels.is_valid_batch(Q[part], self._rf, self._ri, self._D, self._wf, out[part])
+            kernels.is_valid_batch(
+                Q[part], self._rf, self._ri, self._D, self._E, self._wf, out[part]
+            )
 
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return out
@@ -107,7 +123,7 @@ class CollisionChecker:
         if not np.isfinite(q).all():
             raise RobotError(f"configuration is {q.tolist()}; clearance needs finite joint values")
         world, own = np.empty(1), np.empty(1)
-        kernels.clearance_batch(q[None], self._rf, self._ri, self._D, self._wf, world, own)
+        kernels.clearance_batch(q[None], self._rf, self._ri, self._D, self._E, self._wf, world, own)
         return float(world[0])
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
@@ -178,7 +194,7 @@ class CollisionChecker:
         centers, plane, field = np.empty((3, n)), np.empty(n), np.empty(n)
         which = np.empty(n, dtype=np.int64)
         kernels.sphere_clearances(
-            q, self._rf, self._ri, self._D, self._wf, centers, plane, which, field
+            q, self._rf, self._ri, self._D, self._E, self._wf, centers, plane, which, field
         )
         return np.ascontiguousarray(centers.T), plane, which, field
 
@@ -191,7 +207,7 @@ class CollisionChecker:
 
     def _check_motion(self, qa: np.ndarray, qb: np.ndarray, stats: np.ndarray) -> bool:
         return kernels.check_motion(
-            qa, qb, self._rf, self._ri, self._D, self._wf, self.config.min_motion, stats
+            qa, qb, self._rf, self._ri, self._D, self._E, self._wf, self.config.min_motion, stats
         )
 
     def _clearances(self, Q: Numbers) -> tuple[np.ndarray, np.ndarray]:
@@ -205,7 +221,7 @@ class CollisionChecker:
 
         def work(part: slice) -> None:
             kernels.clearance_batch(
-                Q[part], self._rf, self._ri, self._D, self._wf, world[part], own[part]
+                Q[part], self._rf, self._ri, self._D, self._E, self._wf, world[part], own[part]
             )
 
         run_chunked(work, len(Q), _BATCH_CHUNK)
