@@ -39,9 +39,9 @@ class CollisionChecker:
     are not checked against the world: they stand on it.
 
     Construction compiles the kernels if they are not cached on disk (some ten seconds,
-    once per machine). Safe to share between threads; the kernels release the GIL. Single queries cost
-    about a microsecond of compiled code: O(frames + links), plus O(spheres) for the
-    links whose bounding spheres come near something.
+    once per machine). Safe to share between threads; the kernels release the GIL.
+    Single queries cost a microsecond or two of compiled code: O(frames + links), plus
+    O(spheres) for the links whose bounding spheres come near something.
 
     Args:
         world: What to avoid.

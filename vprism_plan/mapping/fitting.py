@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int, Int64
 
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping import negative_sampling as negatives
@@ -111,7 +111,7 @@ def training_data(
     rng: np.random.Generator,
 ) -> TrainingData:
     """Observed points, negative samples and their subsampling (section V)."""
-    clouds = [view.points() for view in views]
+    clouds = [_without_strays(*view.points(), config.stray_share) for view in views]
     points = np.concatenate([cloud for cloud, _ in clouds])
     labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
     lower, upper = negatives.box_centers(points, labels, object_ids, config.box_trim)
@@ -136,10 +136,7 @@ def training_data(
     )  # fmt: skip
     near = _near_any(np.concatenate(empty), centers, config.object_radius)
     free = np.concatenate([grid_subsample(near, config.empty_resolution), *front])
-    surfaces = [
-        grid_subsample(_solid(points[labels == i], config.stray_share), config.object_resolution)
-        for i in object_ids
-    ]
+    surfaces = [grid_subsample(points[labels == i], config.object_resolution) for i in object_ids]
     counts = [len(s) for s in surfaces]
     room = max(config.max_points - sum(counts), 1)
     if len(free) > room:
@@ -157,12 +154,21 @@ def training_data(
     )
 
 
-def _solid(points: Float[np.ndarray, "n 3"], share: float) -> Float[np.ndarray, "m 3"]:
-    """Return an object's points without flying pixels."""
-    stray = stray_points(points, share)
-    if stray.any():
-        logger.info("%d of %d points of an object taken for flying pixels", stray.sum(), len(stray))
-    return points[~stray]
+def _without_strays(
+    points: Float[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], share: float
+) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
+    """Return one view's points and labels without flying pixels.
+
+    Their rays go as well: they end in the shadow of what they fringe, and samples along
+    them would call that shadow empty.
+    """
+    keep = np.ones(len(points), dtype=bool)
+    for label in np.unique(labels[labels > 0]):
+        own = labels == label
+        keep[own] = ~stray_points(points[own], share)
+    if not keep.all():
+        logger.info("%d of %d points taken for flying pixels", (~keep).sum(), len(keep))
+    return points[keep], labels[keep]
 
 
 def new_hinges(
