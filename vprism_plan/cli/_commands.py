@@ -83,8 +83,9 @@ class Plan:
     """OMPL planner."""
     time_limit: float = 5.0
     """Wall time for the search (s)."""
-    margin: float = 0.0
-    """Clearance to keep from everything (m)."""
+    margin: float = 0.005
+    """Clearance to keep from everything (m); the true surface can lie a few millimetres
+    outside the map's."""
     occluded: Literal["occupied", "posterior", "free"] = "occupied"
     """What space behind visible surfaces counts as."""
     unobserved: Literal["free", "occupied"] = "free"

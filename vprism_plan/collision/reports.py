@@ -16,6 +16,13 @@ Kind = Literal[
     "not_finite",
 ]
 
+# How a reason names what is no thing.
+_SPOKEN = {
+    "background": "unlabelled clutter",
+    "occluded": "occluded space",
+    "support surface": "the support surface",
+    "unobserved": "unobserved space",
+}
 # moveit_msgs/ContactInformation body types
 _ROBOT_LINK, _WORLD_OBJECT = 0, 1
 
@@ -58,7 +65,8 @@ class Contact:
             at = " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
         sure = "" if self.probability is None else f", P(occupied) {self.probability:.2f}"
         why = f" ({self.detail})" if self.detail else ""
-        return f"{self.link} is {1000 * self.depth:.1f} mm into {self.body}{at}{sure}{why}"
+        body = _SPOKEN.get(self.body, self.body)
+        return f"{self.link} is {1000 * self.depth:.1f} mm into {body}{at}{sure}{why}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready keys of moveit_msgs/ContactInformation, and ours."""

@@ -1,0 +1,45 @@
+"""What the README shows must run as it stands."""
+
+import re
+import subprocess
+import sys
+
+
+def blocks(text, language):
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.S)
+
+
+def test_the_python_example_runs_and_plans(repository):
+    code = blocks((repository / "README.md").read_text(), "python")[0]
+    assert len(code.strip().splitlines()) <= 15
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=repository, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    plan, reasons = done.stdout.strip().splitlines()
+    assert plan.startswith("exact")
+    assert "panda_" in reasons
+
+
+def test_the_ompl_lines_are_those_of_the_example(repository):
+    shown = blocks((repository / "README.md").read_text(), "python")[1]
+    program = (repository / "examples" / "own_ompl_program.py").read_text()
+    lines = [line.split("#")[0].strip() for line in shown.splitlines() if line.strip()]
+    assert len(lines) <= 10
+    for line in lines:
+        if line.startswith("si.") or "getSpaceInformation" in line:
+            assert line in program
+
+
+def test_links_lead_somewhere(repository):
+    text = (repository / "README.md").read_text()
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        assert (repository / target).exists(), target
+
+
+def test_measured_numbers_name_commands_that_exist(repository):
+    text = (repository / "README.md").read_text()
+    commands = re.findall(r"`python (benchmarks/[a-z_]+\.py)", text)
+    assert len(commands) >= 4
+    for command in commands:
+        assert (repository / command).is_file()
