@@ -24,6 +24,7 @@ from vprism_plan.world.distance import (
     finish,
     round_down,
 )
+from vprism_plan.world.forgotten import forgotten_points
 from vprism_plan.world.grid import Grid, choose_grid
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
 from vprism_plan.world.levelset import lattice_refinement, trace_level_set
@@ -33,12 +34,15 @@ _log = logging.getLogger(__name__)
 
 _CELLS = 2  # cells per grid step for everything that is seen or not seen
 # Marks on that lattice; where several apply the largest wins.
-_UNOBSERVED, _OCCLUDED, _BACKGROUND = 1, 2, 3
+_UNOBSERVED, _OCCLUDED, _BACKGROUND = 1, 2, 3  # and 3 + k: seen surface of class k
 _MAX_OBJECTS = 250
 
 
 class World:
     """Obstacles made of a map, what its cameras saw and did not see, and known geometry.
+
+    Observed points of an object that lie more than a voxel off the level set (parts
+    too thin for the map's kernels) are obstacles of that object, too.
 
     Everything is baked on construction. Sources, in this order: one per object, then
     "background", "occluded", "unobserved", then known geometry; the support surface
@@ -93,7 +97,8 @@ class World:
             visibility.make_view(view, self.config.occlusion_tolerance, map.plane)
             for view in map.views
         ]
-        self._unseen = self._timed("visibility", self._mark_unseen)
+        everything = [self._timed("distance to objects", self._object_distances, None)]
+        self._unseen = self._timed("visibility", self._mark_unseen, everything[0])
         known = self._timed("known geometry", self._known_distances, solids)
         self._known: NodeDistances = combine(known, self.grid)
         others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
@@ -123,8 +128,9 @@ class World:
                 rows.append([*item.normal, item.offset])
         return tuple(names), np.array(rows, dtype=np.float64).reshape(-1, 4)
 
-    def _mark_unseen(self) -> Lattice:
-        """Mark background, occluded and unobserved cells, as the policies say."""
+    def _mark_unseen(self, objects: NodeDistances) -> Lattice:
+        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
+        object of the map holds."""
         config, grid = self.config, self.grid
         spacing = grid.spacing / _CELLS
         cells = tuple(_CELLS * (n - 1) for n in grid.shape)
@@ -147,6 +153,16 @@ class World:
             self.map.views, self.map.plane, config.background_height
         )
         kernels.mark_boxes(points, half, grid.origin, spacing, np.uint8(_BACKGROUND), nodes)
+        for k, points, half in forgotten_points(
+            self.map.views,
+            self.map.object_ids,
+            self.map.plane,
+            config.background_height,
+            objects.distance,
+            grid,
+        ):
+            label = np.uint8(_BACKGROUND + k)
+            kernels.mark_boxes(points, half, grid.origin, spacing, label, nodes)
         return Lattice(nodes, grid.first * _CELLS, _CELLS)
 
     def _trust_posterior(self, status: UInt8[np.ndarray, "nx ny nz"], spacing: float) -> None:
@@ -172,6 +188,8 @@ class World:
         names[_BACKGROUND] = self.sources.index("background")
         names[_OCCLUDED] = self.sources.index("occluded")
         names[_UNOBSERVED] = self.sources.index("unobserved")
+        classes = len(self.map.object_ids)
+        names[_BACKGROUND + 1 : _BACKGROUND + 1 + classes] = np.arange(classes)
         distance, label = distance_to_lattice(lattice, self.grid)
         source = names[label]
         if self.config.unobserved == "occupied":
@@ -257,12 +275,14 @@ class World:
         return [valid.index(i) + 1 for i in object_ids]
 
     def _unseen_outside(self, classes: Collection[int]) -> Lattice:
-        """Return the unseen marks less occluded nodes inside some objects' level set."""
+        """Return the unseen marks less some objects' seen surfaces, and less occluded nodes
+        inside their level set."""
+        labels = self._unseen.labels.copy()
+        labels[np.isin(labels, [_BACKGROUND + k for k in classes])] = 0
         inside = rasterize_level_set(self._level_set, self._factor, classes)
         if inside is None:
-            return self._unseen
+            return Lattice(labels, self._unseen.corner, _CELLS)
         ratio = self._factor // _CELLS
-        labels = self._unseen.labels.copy()
         first = -(-inside.corner // ratio)  # first unseen node not below the fine corner
         skip = first * ratio - inside.corner
         fine = inside.labels[skip[0] :: ratio, skip[1] :: ratio, skip[2] :: ratio]
