@@ -7,8 +7,6 @@ seed, bound and which parts each view has.
 """
 
 import json
-import os
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +15,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from vprism_plan._files import replacing
 from vprism_plan.errors import MapError, VPrismError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior
@@ -62,14 +61,8 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
     arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     if not path.parent.is_dir():
         raise MapError(f"cannot write {path}: the folder {path.parent} does not exist")
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    try:
+    with replacing(path) as temporary:
         save_file(arrays, temporary, metadata={_HEADER: json.dumps(meta)})
-        Path(temporary).chmod(0o666 & ~_umask())
-        Path(temporary).replace(path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
 
 
 def load_map(path: str | Path) -> "VPrismMap":
@@ -159,9 +152,3 @@ def _view(tensors: dict[str, np.ndarray], index: int) -> Observation:
     parts = {part: tensors.get(f"view{index}.{part}") for part in _VIEW_PARTS}
     row = tensors.get(f"view{index}.plane")
     return Observation(**parts, plane=None if row is None else _plane(row))
-
-
-def _umask() -> int:
-    current = os.umask(0)
-    os.umask(current)
-    return current

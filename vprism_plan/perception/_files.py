@@ -2,14 +2,13 @@
 """Reading and writing images and JSON so that every failure is one clear line."""
 
 import json
-import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from vprism_plan._files import replacing
 from vprism_plan.errors import ObservationError
 
 _DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I")
@@ -109,16 +108,5 @@ def matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Write through a temporary file beside `path`, so no half-written file ever remains."""
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            write(stream)
-        # mkstemp makes files private; give them what open() would have given.
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with replacing(path) as temporary, temporary.open("wb") as stream:
+        write(stream)
