@@ -157,3 +157,13 @@ def _bundled():
     from vprism_plan._resources import data_path
 
     return data_path("demo_scene")
+
+
+@pytest.mark.parametrize("title", [None, "a title"])
+def test_saved_at_once_no_label_is_cut_off(demo_map, tmp_path, title):
+    save_figure(map_figure(demo_map, title=title), tmp_path / "map.png")
+    with Image.open(tmp_path / "map.png") as picture:
+        ink = np.asarray(picture.convert("L")) < 200
+    assert not ink[:, :2].any()
+    assert not ink[:, -2:].any()
+    assert ink.mean() > 0.1

@@ -40,6 +40,9 @@ def new_figure(width: float, height: float) -> Figure:
 
 def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as PNG, whole or not at all."""
+    # The constrained layout settles over draws: saved at once, it can cut labels off.
+    for _ in range(2):
+        figure.draw_without_rendering()
     with replacing(path) as temporary:
         # A fixed "Software" entry keeps equal pictures equal in bytes.
         figure.savefig(temporary, format="png", metadata={"Software": "vprism_plan"})
