@@ -42,7 +42,8 @@ def run_demo(output: Path, seed: int, console: "Console") -> int:
     around = Surroundings.of(m)
     pose = base_pose(np.array(BASE_XYZ), around, BASE_YAW)
     robot = Robot.from_urdf(urdf_path("panda"), base_pose=pose)
-    checker = CollisionChecker(world, robot, CheckerConfig(margin=MARGIN))
+    with console.stage("check"):  # compiles on first use
+        checker = CollisionChecker(world, robot, CheckerConfig(margin=MARGIN))
     with console.stage("place"):
         # Left of the arm is the camera's side: it starts where everything is seen.
         ends = choose_ends(checker, robot, around, np.random.default_rng(seed))

@@ -405,10 +405,13 @@ def is_valid(q, rf, ri, D, E, wf):
 
 @njit(cache=True, nogil=True)
 def is_valid_batch(Q, rf, ri, D, E, wf, out):
-    """Fill out (n,) with `is_valid` of each row of Q (n, dof)."""
-    T, lc, C, placed = _scratch(ri)
+    """Fill out (n,) with `is_valid` of each row of Q (n, dof).
+
+    Calls it, although one scratch for all rows would save a tenth: compiling its body
+    a second time takes five seconds.
+    """
     for n in range(Q.shape[0]):
-        out[n] = _state_valid(Q[n], rf, ri, D, E, wf, T, lc, C, placed)
+        out[n] = is_valid(Q[n], rf, ri, D, E, wf)
 
 
 @njit(cache=True, nogil=True)

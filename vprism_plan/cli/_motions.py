@@ -96,8 +96,9 @@ def run_query(command: Query, console: Console) -> int:
         m = load_map(command.map)
     world = _bake(m, command, console)
     robot = _standing(command, robot, world, Surroundings.of(m))
-    checker = _checker(world, robot, command.margin)
-    report = checker.explain(q)
+    with console.stage("check"):  # compiles on first use
+        checker = _checker(world, robot, command.margin)
+        report = checker.explain(q)
     base = robot.base_pose
     payload = {
         **report.to_dict(),
