@@ -38,7 +38,7 @@ class CollisionChecker:
     distances are lower bounds, so an error can only refuse. Links that no joint moves
     are not checked against the world: they stand on it.
 
-    Construction compiles the kernels if they are not cached on disk (some ten seconds,
+    Construction compiles the kernels if they are not cached on disk (some twenty seconds,
     once per machine). Safe to share between threads; the kernels release the GIL.
     Single queries cost a microsecond or two of compiled code: O(frames + links), plus
     O(spheres) for the links whose bounding spheres come near something.
