@@ -6,7 +6,7 @@ argument costs a call about 60 ns and the whole state check takes about one
 microsecond. `vprism_plan.collision._packing` documents and fills the layouts:
 
 robot floats `rf`, robot integers `ri`:
-    ri[0:8]   = n_frames, n_spheres, n_links, n_pairs, dof, most spheres on a link, 0, 0
+    ri[0:8]   = n_frames, n_spheres, n_links, n_pairs, dof, 0, 0, 0
     ri[8:16]  = offsets into ri of: frame ints (parent, kind, q index), link ints
                 (frame, first sphere, end sphere, fixed), pairs (a, b), continuous flags
     ri[16:24] = offsets into rf of: frame floats (R 9, t 3, multiplier, offset), spheres
@@ -368,10 +368,7 @@ def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
 
 @njit(cache=True, nogil=True, inline="always")
 def _scratch(ri):
-    """Room for frame poses, link centres, sphere centres and which links are placed.
-
-    Four allocations: views of one would keep the loops from vectorising.
-    """
+    """Room for frame poses, link centres, sphere centres and which links are placed."""
     n_links = ri[2]
     C = np.empty((3, ri[1]))
     return np.empty((ri[0], 12)), np.empty((n_links, 3)), C, np.empty(n_links, np.bool_)
@@ -407,8 +404,7 @@ def is_valid(q, rf, ri, D, E, wf):
 def is_valid_batch(Q, rf, ri, D, E, wf, out):
     """Fill out (n,) with `is_valid` of each row of Q (n, dof).
 
-    Calls it, although one scratch for all rows would save a tenth: compiling its body
-    a second time takes five seconds.
+    Calls it rather than inlining its body again, which would compile for seconds more.
     """
     for n in range(Q.shape[0]):
         out[n] = is_valid(Q[n], rf, ri, D, E, wf)

@@ -160,14 +160,7 @@ def pack_robot(arrays: KinematicArrays, self_margin: float = 0.0) -> PackedRobot
     link_ints = np.column_stack([arrays.link_frame, starts, ends, arrays.link_fixed.astype(int)])
     int_parts = [frame_ints, link_ints, arrays.pairs, arrays.continuous.astype(np.int64)]
     header = np.zeros(_HEADER, dtype=np.int64)
-    header[:6] = (
-        n_frames,
-        len(spheres),
-        n_links,
-        len(arrays.pairs),
-        len(arrays.lower),
-        max(1, int(np.max(ends - starts))),
-    )
+    header[:5] = n_frames, len(spheres), n_links, len(arrays.pairs), len(arrays.lower)
     header[8:12] = _HEADER + np.cumsum([0, *[part.size for part in int_parts[:-1]]])
     header[16:22] = np.cumsum([0, *[part.size for part in float_parts[:-1]]])
     floats = np.concatenate(
