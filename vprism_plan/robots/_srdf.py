@@ -18,11 +18,13 @@ class SemanticModel:
 
     Attributes:
         groups: Group name -> names of the joints in it, in file order.
+        group_links: Group name -> names of the links in it, in file order.
         states: (state name, group) -> joint name -> value, in file order.
         disabled: Unordered link pair -> the reason the file gives.
     """
 
     groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    group_links: dict[str, tuple[str, ...]] = field(default_factory=dict)
     states: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
     disabled: dict[frozenset[str], str] = field(default_factory=dict)
 
@@ -60,27 +62,38 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
         raise RobotError(f"'{path}' is not well-formed XML: {error}") from error
     if root.tag != "robot":
         raise RobotError(f"the root element of '{path}' is <{root.tag}>, an SRDF has <robot>")
-    groups = _groups(root, model, path)
-    return SemanticModel(groups, _states(root, model, path), _disabled(root, model, path))
+    groups, links = _groups(root, model, path)
+    return SemanticModel(groups, links, _states(root, model, path), _disabled(root, model, path))
 
 
-def _groups(root: ET.Element, model: RobotModel, path: Path) -> dict[str, tuple[str, ...]]:
+def _groups(
+    root: ET.Element, model: RobotModel, path: Path
+) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+    """The joints and the links of every group.
+
+    As in MoveIt, the links of a group are those that its joints move directly: the base
+    of a chain is not one of them, nor is what hangs below a joint's child.
+    """
     groups: dict[str, tuple[str, ...]] = {}
+    links: dict[str, tuple[str, ...]] = {}
     parent_of = {joint.child: joint for joint in model.joints}
     # A virtual joint ties the base to the world; it is no joint of the URDF.
     virtual = {element.get("name", "") for element in root.findall("virtual_joint")}
     for group in root.findall("group"):
         joints: list[str] = []
+        named: list[str] = []
         for member in group:
             name = member.get("name", "")
             if member.tag == "joint" and name not in virtual:
                 joints.append(_known(name, model.joint_map, "joint", path))
+                named.append(model.joint_map[name].child)
             elif member.tag == "link":
-                _known(name, model.links, "link", path)
+                named.append(_known(name, model.links, "link", path))
                 if name in parent_of:
                     joints.append(parent_of[name].name)
             elif member.tag == "group":
                 joints += groups[_known(name, groups, "group", path)]
+                named += links[name]
             elif member.tag == "chain":
                 base = _known(member.get("base_link", ""), model.links, "link", path)
                 tip = _known(member.get("tip_link", ""), model.links, "link", path)
@@ -94,8 +107,10 @@ def _groups(root: ET.Element, model: RobotModel, path: Path) -> dict[str, tuple[
                     chain.append(parent_of[tip].name)
                     tip = parent_of[tip].parent
                 joints += reversed(chain)
+                named += [model.joint_map[joint].child for joint in reversed(chain)]
         groups[group.get("name", "")] = tuple(dict.fromkeys(joints))
-    return groups
+        links[group.get("name", "")] = tuple(dict.fromkeys(named))
+    return groups, links
 
 
 def _states(

@@ -47,6 +47,8 @@ class Robot:
         link_names: The links that carry collision spheres.
         geometry: Link name -> its primitive solids (links without any are absent).
         named_states: SRDF states that fix every joint of ``joint_names``.
+        groups: SRDF group -> names of its links: the children of its joints and the links
+            it names, with or without spheres (:meth:`links_of` gives those with spheres).
         disabled_pairs: Unordered link pair -> the SRDF's reason for not testing it.
         arrays: The flat form that compiled kernels read.
     """
@@ -59,6 +61,7 @@ class Robot:
     link_names: tuple[str, ...]
     geometry: dict[str, tuple[PrimitiveGeometry, ...]]
     named_states: dict[str, np.ndarray]
+    groups: dict[str, tuple[str, ...]]
     disabled_pairs: dict[frozenset[str], str]
     arrays: KinematicArrays
     _links: dict[str, _frames.Attachment] = field(repr=False)
@@ -126,6 +129,7 @@ class Robot:
             link_names=tuple(balls),
             geometry={n: link.primitives for n, link in model.links.items() if link.primitives},
             named_states=states,
+            groups=dict(semantics.group_links),
             disabled_pairs=dict(semantics.disabled),
             arrays=arrays,
             _links=links,
@@ -183,6 +187,29 @@ class Robot:
     def reach(self) -> float:
         """Upper bound on how far any sphere gets from the root link's origin, metres."""
         return _frames.reach_bound(self.arrays)
+
+    def links_of(self, name: str) -> tuple[str, ...]:
+        """The links with collision spheres that a name stands for.
+
+        Args:
+            name: A link of ``link_names`` or an SRDF group. Where both have the name, it
+                is the link.
+
+        Raises:
+            RobotError: There is no such link or group, or it has no collision spheres.
+        """
+        if name in self.link_names:
+            return (name,)
+        members = tuple(link for link in self.groups.get(name, ()) if link in self.link_names)
+        if members:
+            return members
+        what = "is"
+        if name in self.groups or name in self._links:
+            what = "has no collision spheres, so it is"
+        raise RobotError(
+            f"{name!r} {what} no link or group of {self.name} to check; "
+            f"links: {list(self.link_names)}, groups: {sorted(self.groups)}"
+        )
 
     def sphere_centers(
         self, q: Float[torch.Tensor, "*batch dof"]
