@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     )
     from vprism_plan.planning import plan
     from vprism_plan.robots import Robot
-    from vprism_plan.world import World, WorldConfig, extract_meshes
+    from vprism_plan.world import PosteriorWorlds, World, WorldConfig, extract_meshes
 
 __version__ = "0.1.0"
 
@@ -42,6 +42,7 @@ _HOMES = {
     "segment_tabletop": "perception",
     "plan": "planning",
     "Robot": "robots",
+    "PosteriorWorlds": "world",
     "World": "world",
     "WorldConfig": "world",
     "extract_meshes": "world",
@@ -52,6 +53,7 @@ __all__ = [
     "CollisionChecker",
     "MapConfig",
     "Observation",
+    "PosteriorWorlds",
     "Robot",
     "VPrismError",
     "VPrismMap",

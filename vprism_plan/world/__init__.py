@@ -6,6 +6,7 @@ from vprism_plan.world.distance import DistanceField
 from vprism_plan.world.grid import Grid
 from vprism_plan.world.known import Box, Cylinder, HalfSpace, KnownMesh, Sphere
 from vprism_plan.world.meshes import extract_meshes, extract_union_mesh
+from vprism_plan.world.posterior_worlds import PosteriorWorlds
 from vprism_plan.world.world import World
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "Grid",
     "HalfSpace",
     "KnownMesh",
+    "PosteriorWorlds",
     "Sphere",
     "World",
     "WorldConfig",

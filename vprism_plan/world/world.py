@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vprism_plan._kernels import world as kernels
 from vprism_plan.errors import WorldError
 from vprism_plan.world import visibility
-from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.config import OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
@@ -24,17 +23,22 @@ from vprism_plan.world.distance import (
     finish,
     round_down,
 )
-from vprism_plan.world.forgotten import forgotten_points
 from vprism_plan.world.grid import Grid, choose_grid
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
 from vprism_plan.world.levelset import lattice_refinement, trace_level_set
+from vprism_plan.world.posterior_worlds import PosteriorWorlds
 from vprism_plan.world.rasterize import rasterize_level_set, rasterize_mesh
+from vprism_plan.world.unseen import (
+    BACKGROUND,
+    CELLS,
+    OCCLUDED,
+    UNOBSERVED,
+    mark_unseen,
+    unmark,
+)
 
 _log = logging.getLogger(__name__)
 
-_CELLS = 2  # cells per grid step for everything that is seen or not seen
-# Marks on that lattice; where several apply the largest wins.
-_UNOBSERVED, _OCCLUDED, _BACKGROUND = 1, 2, 3  # and 3 + k: seen surface of class k
 _MAX_OBJECTS = 250
 
 
@@ -97,16 +101,19 @@ class World:
             visibility.make_view(view, self.config.occlusion_tolerance, map.plane)
             for view in map.views
         ]
-        everything = [self._timed("distance to objects", self._object_distances, None)]
-        self._unseen = self._timed("visibility", self._mark_unseen, everything[0])
+        self._objects: NodeDistances = self._timed(
+            "distance to objects", self._object_distances, None
+        )
+        self._unseen = self._timed("visibility", self._mark_unseen, self.config.occluded)
         known = self._timed("known geometry", self._known_distances, solids)
         self._known: NodeDistances = combine(known, self.grid)
         others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
-        objects = self._timed("distance to objects", self._object_distances, None)
         self.field: DistanceField = self._timed(
-            "combine", self._field, [objects, others, self._known]
+            "combine", self._field, [self._objects, others, self._known]
         )
         self._cache: dict[tuple[str, frozenset[int]], DistanceField] = {}
+        self._beyond_support: Lattice | None = None
+        self._draws: dict[tuple[int, int], PosteriorWorlds] = {}
         _log.debug("world baked: %s nodes, %s", self.field.distance.size, self.timings)
 
     def _timed(self, name: str, step: Any, *args: Any) -> Any:
@@ -128,75 +135,25 @@ class World:
                 rows.append([*item.normal, item.offset])
         return tuple(names), np.array(rows, dtype=np.float64).reshape(-1, 4)
 
-    def _mark_unseen(self, objects: NodeDistances) -> Lattice:
-        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
-        object of the map holds."""
-        config, grid = self.config, self.grid
-        spacing = grid.spacing / _CELLS
-        cells = tuple(_CELLS * (n - 1) for n in grid.shape)
-        shape = (cells[0], cells[1], cells[2])
-        nodes = np.zeros(tuple(n + 1 for n in shape), dtype=np.uint8)
-        if config.occluded != "free" or config.unobserved != "free":
-            status = visibility.classify_cells(
-                self._views, self.map.plane, grid.origin, spacing, shape
-            )
-            shadow = 0 if config.occluded == "free" else _OCCLUDED
-            unseen = 0 if config.unobserved == "free" else _UNOBSERVED
-            marks = np.zeros(4, dtype=np.uint8)
-            marks[kernels.OCCLUDED] = shadow
-            marks[kernels.PARTLY] = shadow or unseen
-            marks[kernels.UNOBSERVED] = unseen
-            if config.occluded == "posterior":
-                self._trust_posterior(status, spacing)
-            _mark_corners(marks[status], nodes)
-        points, half = visibility.background_points(
-            self.map.views, self.map.plane, config.background_height
+    def _mark_unseen(self, occluded: OccludedPolicy) -> Lattice:
+        return mark_unseen(
+            self.map, self._views, self.config, occluded, self.grid, self._objects.distance
         )
-        kernels.mark_boxes(points, half, grid.origin, spacing, np.uint8(_BACKGROUND), nodes)
-        for k, points, half in forgotten_points(
-            self.map.views,
-            self.map.object_ids,
-            self.map.plane,
-            config.background_height,
-            objects.distance,
-            grid,
-        ):
-            label = np.uint8(_BACKGROUND + k)
-            kernels.mark_boxes(points, half, grid.origin, spacing, label, nodes)
-        return Lattice(nodes, grid.first * _CELLS, _CELLS)
-
-    def _trust_posterior(self, status: UInt8[np.ndarray, "nx ny nz"], spacing: float) -> None:
-        """Call occluded cells free where the map has support: its level set decides there."""
-        origin = self.grid.origin
-        lower, upper = (np.asarray(c) for c in self.map.support_bounds())
-        first = np.clip(np.floor((lower - origin) / spacing).astype(int), 0, status.shape)
-        last = np.clip(np.ceil((upper - origin) / spacing).astype(int), 0, status.shape)
-        for x in range(int(first[0]), int(last[0])):
-            part = status[x, first[1] : last[1], first[2] : last[2]]
-            hidden = np.argwhere((part == kernels.OCCLUDED) | (part == kernels.PARTLY))
-            if len(hidden) == 0:
-                continue
-            index = np.column_stack([np.full(len(hidden), x), hidden + first[1:]])
-            centers = origin + spacing * (index + 0.5)
-            known = np.asarray(self.map.support(centers)) >= self.config.min_support
-            where = tuple(hidden[known].T)
-            whole = part[where] == kernels.OCCLUDED
-            part[where] = np.where(whole, kernels.FREE, kernels.UNOBSERVED)
 
     def _unseen_distances(self, lattice: Lattice) -> NodeDistances:
         names = np.full(256, -1, dtype=np.int16)
-        names[_BACKGROUND] = self.sources.index("background")
-        names[_OCCLUDED] = self.sources.index("occluded")
-        names[_UNOBSERVED] = self.sources.index("unobserved")
+        names[BACKGROUND] = self.sources.index("background")
+        names[OCCLUDED] = self.sources.index("occluded")
+        names[UNOBSERVED] = self.sources.index("unobserved")
         classes = len(self.map.object_ids)
-        names[_BACKGROUND + 1 : _BACKGROUND + 1 + classes] = np.arange(classes)
+        names[BACKGROUND + 1 : BACKGROUND + 1 + classes] = np.arange(classes)
         distance, label = distance_to_lattice(lattice, self.grid)
         source = names[label]
         if self.config.unobserved == "occupied":
             faces = _distance_to_faces(self.grid)
             closer = faces < distance
             np.copyto(distance, faces, where=closer)
-            np.copyto(source, names[_UNOBSERVED], where=closer)
+            np.copyto(source, names[UNOBSERVED], where=closer)
         return NodeDistances(distance, source)
 
     def _object_distances(self, classes: Collection[int] | None) -> NodeDistances:
@@ -213,7 +170,7 @@ class World:
         for item in solids:
             index = self.sources.index(f"known:{item.name}")
             if isinstance(item, KnownMesh):
-                lattice = rasterize_mesh(item, self.grid, _CELLS)
+                lattice = rasterize_mesh(item, self.grid, CELLS)
                 distance, _ = distance_to_lattice(lattice, self.grid)
             else:
                 distance = np.empty(self.grid.shape, dtype=np.float32)
@@ -263,9 +220,53 @@ class World:
         if key not in self._cache:
             rest = set(range(1, len(self.map.object_ids) + 1)) - gone
             kept = self._object_distances(rest)
-            unseen = self._unseen_distances(self._unseen_outside(gone))
+            unseen = self._unseen_distances(self._without(self._unseen, gone))
             self._cache[key] = self._field([kept, unseen, self._known])
         return self._cache[key]
+
+    def certain_field(self, without: Collection[int] = ()) -> DistanceField:
+        """Distance to what is an obstacle whatever the posterior says.
+
+        Background, seen parts that the level set misses, known geometry, unobserved space
+        by its policy, and occluded space where the map has too little support to judge
+        (unless the policy is "free"). The rest is for `posterior_worlds` to say. The seen
+        parts of the objects `without` are left out.
+
+        Raises:
+            WorldError: the map has no such object.
+        """
+        gone = frozenset(self._classes(without))
+        key = ("certain", gone)
+        if key not in self._cache:
+            if self._beyond_support is None:
+                free = self.config.occluded == "free"
+                self._beyond_support = self._mark_unseen("free" if free else "posterior")
+            marks = self._without(self._beyond_support, gone) if gone else self._beyond_support
+            self._cache[key] = self._field([self._unseen_distances(marks), self._known])
+        return self._cache[key]
+
+    def posterior_worlds(
+        self, n_worlds: int = 256, seed: int = 0, reach: float = 0.2
+    ) -> PosteriorWorlds:
+        """Return joint draws of the map on voxels of this world's resolution; kept and shared.
+
+        Args:
+            n_worlds: number of draws, a multiple of 64.
+            seed: of the draws.
+            reach: see `PosteriorWorlds`; draws with at least this reach are used again.
+
+        Raises:
+            WorldError: see `PosteriorWorlds`.
+        """
+        kept = self._draws.get((n_worlds, seed))
+        if kept is None or kept.reach < reach:
+            kept = PosteriorWorlds(self.map, n_worlds, seed, self.config.resolution, reach)
+            self._draws[n_worlds, seed] = kept
+        return kept
+
+    def _without(self, marks: Lattice, classes: Collection[int]) -> Lattice:
+        inside = rasterize_level_set(self._level_set, self._factor, classes)
+        return unmark(marks, classes, inside)
 
     def _classes(self, object_ids: Collection[int]) -> list[int]:
         valid = list(self.map.object_ids)
@@ -273,27 +274,6 @@ class World:
         if unknown:
             raise WorldError(f"no object {unknown[0]} in the map; it has {valid}")
         return [valid.index(i) + 1 for i in object_ids]
-
-    def _unseen_outside(self, classes: Collection[int]) -> Lattice:
-        """Return the unseen marks less some objects' seen surfaces, and less occluded nodes
-        inside their level set."""
-        labels = self._unseen.labels.copy()
-        labels[np.isin(labels, [_BACKGROUND + k for k in classes])] = 0
-        inside = rasterize_level_set(self._level_set, self._factor, classes)
-        if inside is None:
-            return Lattice(labels, self._unseen.corner, _CELLS)
-        ratio = self._factor // _CELLS
-        first = -(-inside.corner // ratio)  # first unseen node not below the fine corner
-        skip = first * ratio - inside.corner
-        fine = inside.labels[skip[0] :: ratio, skip[1] :: ratio, skip[2] :: ratio]
-        start = first - self._unseen.corner
-        low = np.maximum(start, 0)
-        high = np.minimum(start + np.array(fine.shape), labels.shape)
-        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        part = fine[tuple(slice(a, b) for a, b in zip(low - start, high - start, strict=True))]
-        target = labels[window]
-        target[(part != 0) & (target == _OCCLUDED)] = 0
-        return Lattice(labels, self._unseen.corner, _CELLS)
 
     def status(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """What the cameras know of each world point, whatever the policies say.
@@ -332,19 +312,6 @@ class World:
     def empty(self) -> bool:
         """Whether nothing but half-spaces is an obstacle."""
         return bool((self.field.source < 0).all())
-
-
-def _mark_corners(cells: UInt8[np.ndarray, "x y z"], nodes: UInt8[np.ndarray, "x1 y1 z1"]) -> None:
-    """Give every node the largest mark of the eight cells around it."""
-    x, y, z = cells.shape
-    grown = np.zeros((x + 1, y, z), dtype=np.uint8)
-    grown[:-1] = cells
-    np.maximum(grown[1:], cells, out=grown[1:])
-    wider = np.zeros((x + 1, y + 1, z), dtype=np.uint8)
-    wider[:, :-1] = grown
-    np.maximum(wider[:, 1:], grown, out=wider[:, 1:])
-    nodes[:, :, :-1] = wider
-    np.maximum(nodes[:, :, 1:], wider, out=nodes[:, :, 1:])
 
 
 def _distance_to_faces(grid: Grid) -> np.ndarray:
