@@ -51,6 +51,8 @@ class Robot:
             it names, with or without spheres (:meth:`links_of` gives those with spheres).
         disabled_pairs: Unordered link pair -> the SRDF's reason for not testing it.
         arrays: The flat form that compiled kernels read.
+        links_with_meshes: Links whose collision geometry has meshes, which are not read:
+            what ``geometry`` holds of them is not the whole link.
     """
 
     name: str
@@ -66,6 +68,7 @@ class Robot:
     arrays: KinematicArrays
     _links: dict[str, _frames.Attachment] = field(repr=False)
     _torch: TorchKinematics = field(repr=False)
+    links_with_meshes: tuple[str, ...] = ()
 
     @classmethod
     def from_urdf(
@@ -134,6 +137,7 @@ class Robot:
             arrays=arrays,
             _links=links,
             _torch=TorchKinematics(arrays),
+            links_with_meshes=tuple(n for n, link in model.links.items() if link.meshes),
         )
 
     @property
