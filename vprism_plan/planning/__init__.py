@@ -3,6 +3,7 @@
 
 from vprism_plan.planning._protocol import CheckerLike as CheckerLike
 from vprism_plan.planning._protocol import RobotLike as RobotLike
+from vprism_plan.planning._protocol import SecondOpinion as SecondOpinion
 from vprism_plan.planning._runtime import quiet_ompl as quiet_ompl
 from vprism_plan.planning._spaces import state_space as state_space
 from vprism_plan.planning._spaces import to_array as to_array

@@ -73,6 +73,18 @@ class CheckerLike(Protocol):
 
 
 @runtime_checkable
+class SecondOpinion(Protocol):
+    """Another judge of paths, see `vprism_plan.collision.MeshChecker`."""
+
+    @property
+    def robot(self) -> Any:
+        """The robot, see `RobotLike`."""
+
+    def review(self, checker: Any, path: Any) -> Any:
+        """An opinion on a path (T, dof) that `checker` accepted: `valid` and `text()`."""
+
+
+@runtime_checkable
 class ReasonedReport(Protocol):
     """A verdict on a configuration that can say why, and what nobody has seen."""
 

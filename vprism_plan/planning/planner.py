@@ -11,10 +11,11 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning._protocol import CheckerLike
+from vprism_plan.planning._protocol import CheckerLike, SecondOpinion
 from vprism_plan.planning._query import configuration, refuse, search_request, valid_goals
 from vprism_plan.planning._runtime import MAX_SEED
 from vprism_plan.planning._search import SearchRequest, search
+from vprism_plan.planning._second_opinion import refuse_unfit, reviewed
 from vprism_plan.planning._shortcut import shorten
 from vprism_plan.planning._verify import MotionCheck, resample, split_turns, verified
 from vprism_plan.planning.goals import PoseGoalConfig
@@ -41,6 +42,7 @@ def plan(
     interpolate: float | None = None,
     clearance_step: float = 0.05,
     pose_goal: PoseGoalConfig | None = None,
+    second_opinion: SecondOpinion | None = None,
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
@@ -72,6 +74,8 @@ def plan(
             pass the check by themselves stays whole.
         clearance_step: distance between the samples of the reported clearance.
         pose_goal: how a pose is turned into configurations.
+        second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
+            the path is still handed out: the report and the message say so.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -85,6 +89,7 @@ def plan(
             raise PlanningError(f"{name} is {value!r}; it must be more than 0")
     if not simplify_time >= 0.0:
         raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
+    refuse_unfit(second_opinion, checker)
     q_start = configuration(start, checker.robot, "start")
     report = PlanReport(planner=planner, seed=request.seed, time_limit=request.time_limit)
 
@@ -102,8 +107,10 @@ def plan(
     if direct is not None:
         index, path = direct
         report = replace(report, direct=True, goal_index=index)
-        return verified(checker, finish.resampled(checker, path), clearance_step, report)
-    return _searched(checker, q_start, goals, request, finish, report)
+        result = verified(checker, finish.resampled(checker, path), clearance_step, report)
+    else:
+        result = _searched(checker, q_start, goals, request, finish, report)
+    return reviewed(result, checker, second_opinion)
 
 
 @dataclass(frozen=True)

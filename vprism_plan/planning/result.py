@@ -43,6 +43,10 @@ class PlanReport:
         shares: largest share of the robot's volume, at the waypoints, that lies in each
             kind of unseen space ("occluded", "unobserved", ...); what the checker
             reports, empty if it reports nothing.
+        second_opinion: what another judge says of the verified path (`valid`, `text()`,
+            with `MeshChecker` a `PathOpinion` that says who disagrees, where and why);
+            None if nobody was asked or there is no path.
+        second_opinion_time: seconds that took.
     """
 
     planner: str
@@ -63,6 +67,8 @@ class PlanReport:
     certified: bool = False
     tolerance: float = float("nan")
     shares: dict[str, float] = field(default_factory=dict)
+    second_opinion: Any = None
+    second_opinion_time: float = 0.0
 
 
 @dataclass(frozen=True)
