@@ -8,16 +8,17 @@ microsecond. `vprism_plan.collision._packing` documents and fills the layouts:
 robot floats `rf`, robot integers `ri`:
     ri[0:8]   = n_frames, n_spheres, n_links, n_pairs, dof, 0, 0, 0
     ri[8:16]  = offsets into ri of: frame ints (parent, kind, q index), link ints
-                (frame, first sphere, end sphere, fixed), pairs (a, b), continuous flags
+                (frame, first sphere, end sphere, rule), pairs (a, b), continuous flags
     ri[16:24] = offsets into rf of: frame floats (R 9, t 3, multiplier, offset), spheres
                 (all x, all y, all z, all radii), link bounding spheres (x, y, z,
                 radius), limits (lower, upper), reach table (n_frames, n_links), self margin
 
-Frame 0 is the base; every other frame moves about or along its own z axis.
+Frame 0 is the base; every other frame moves about or along its own z axis. A link's
+rule says which of the fields it is checked against; -1: none (it stands on the world).
 
 world floats `wf` = origin x, y, z, spacing, outside_occupied, n_planes, margin, then
     four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset).
-distance field `D` (nx, ny, nz) float32: lower bounds of the signed distance at nodes.
+distance fields `D` (rules, nx, ny, nz) float32: lower bounds of the signed distance at nodes.
 block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 x 4 cells.
 """
 
@@ -110,7 +111,7 @@ def _transform(T, f, rf, o, out, row):
 
 
 @njit(cache=True, nogil=True)
-def _cell_bound(D, h, cx, cy, cz):
+def _cell_bound(D, rule, h, cx, cy, cz):
     """Lower bound of the distance at grid point c from the eight nodes around it, metres.
 
     Two rules, both proofs from distances d_i at the nodes x_i; the larger counts.
@@ -121,9 +122,9 @@ def _cell_bound(D, h, cx, cy, cz):
     trilinear weights w_i and cell fractions f_a, where d_i >= 0,
     d(x)^2 >= sum_i w_i d_i^2 - h^2 sum_a f_a (1 - f_a).
     """
-    i0 = min(int(cx), D.shape[0] - 2)
-    j0 = min(int(cy), D.shape[1] - 2)
-    k0 = min(int(cz), D.shape[2] - 2)
+    i0 = min(int(cx), D.shape[1] - 2)
+    j0 = min(int(cy), D.shape[2] - 2)
+    k0 = min(int(cz), D.shape[3] - 2)
     fx = cx - i0
     fy = cy - j0
     fz = cz - k0
@@ -136,7 +137,7 @@ def _cell_bound(D, h, cx, cy, cz):
             wb = wa * (fy if b else 1.0 - fy)
             eb = ea + (fy - b) ** 2
             for c in range(2):
-                d = D[i0 + a, j0 + b, k0 + c]
+                d = D[rule, i0 + a, j0 + b, k0 + c]
                 cone = max(cone, d - h * np.sqrt(eb + (fz - c) ** 2))
                 d = min(max(d, 0.0), 1e9)  # no obstacle at all is an infinite distance
                 square += wb * (fz if c else 1.0 - fz) * d * d
@@ -146,7 +147,7 @@ def _cell_bound(D, h, cx, cy, cz):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def field_bound(D, E, wf, x, y, z, enough, deep):
+def field_bound(D, E, wf, rule, x, y, z, enough, deep):
     """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
 
     Asked in this order until a bound exceeds `enough`; each is never below the one
@@ -159,9 +160,9 @@ def field_bound(D, E, wf, x, y, z, enough, deep):
     grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex.
     """
     h = wf[3]
-    nx = D.shape[0]
-    ny = D.shape[1]
-    nz = D.shape[2]
+    nx = D.shape[1]
+    ny = D.shape[2]
+    nz = D.shape[3]
     gx = (x - wf[0]) / h
     gy = (y - wf[1]) / h
     gz = (z - wf[2]) / h
@@ -174,14 +175,15 @@ def field_bound(D, E, wf, x, y, z, enough, deep):
         if out2 > 0.0 and wf[4] > 0.0:
             best = -h * np.sqrt(out2)
         else:
-            best = float(E[int(cx) >> 2, int(cy) >> 2, int(cz) >> 2])
+            best = float(E[rule, int(cx) >> 2, int(cy) >> 2, int(cz) >> 2])
             if best <= enough:
                 i = int(cx + 0.5)
                 j = int(cy + 0.5)
                 k = int(cz + 0.5)
-                best = D[i, j, k] - h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
+                away = h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
+                best = D[rule, i, j, k] - away
                 if deep and best <= enough:
-                    best = max(best, _cell_bound(D, h, cx, cy, cz))
+                    best = max(best, _cell_bound(D, rule, h, cx, cy, cz))
             if out2 > 0.0:
                 inside = max(best, 0.0)
                 best = np.sqrt(out2 * h * h + inside * inside)
@@ -227,14 +229,15 @@ def _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
     # Distal links first: the hand is what hits things.
     for link in range(ri[2] - 1, -1, -1):
         li = ri[9] + 4 * link
-        if ri[li + 3] != 0:
+        rule = ri[li + 3]
+        if rule < 0:
             continue
         need = margin + rf[ri[18] + 4 * link + 3]
         x = lc[link, 0]
         y = lc[link, 1]
         z = lc[link, 2]
         plane_ok = plane_bound(wf, x, y, z) > need
-        field_ok = field_bound(D, E, wf, x, y, z, need, False) > need
+        field_ok = field_bound(D, E, wf, rule, x, y, z, need, False) > need
         if plane_ok and field_ok:
             continue
         if not placed[link]:
@@ -247,7 +250,7 @@ def _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
             need = margin + rf[ro + s]
             if not plane_ok and not plane_bound(wf, x, y, z) > need:
                 return False
-            if not field_ok and not field_bound(D, E, wf, x, y, z, need, True) > need:
+            if not field_ok and not field_bound(D, E, wf, rule, x, y, z, need, True) > need:
                 return False
     return True
 
@@ -260,11 +263,12 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, enough):
     larger of the two: that keeps this consistent with `_world_clear`.
     """
     r = rf[ri[18] + 4 * link + 3]
+    rule = ri[ri[9] + 4 * link + 3]
     x = lc[link, 0]
     y = lc[link, 1]
     z = lc[link, 2]
     plane_all = plane_bound(wf, x, y, z) - r
-    field_all = field_bound(D, E, wf, x, y, z, _INF, False) - r
+    field_all = field_bound(D, E, wf, rule, x, y, z, _INF, False) - r
     if min(plane_all, field_all) >= enough:
         return min(plane_all, field_all)
     if not placed[link]:
@@ -279,7 +283,7 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, enough):
         z = C[2, s]
         r = rf[ro + s]
         plane = max(plane_bound(wf, x, y, z) - r, plane_all)
-        field = max(field_bound(D, E, wf, x, y, z, _INF, True) - r, field_all)
+        field = max(field_bound(D, E, wf, rule, x, y, z, _INF, True) - r, field_all)
         best = min(best, plane, field)
     return best
 
@@ -419,7 +423,7 @@ def clearance_batch(Q, rf, ri, D, E, wf, world, own):
         _pose(Q[n], rf, ri, T, lc, placed)
         best = _INF
         for link in range(ri[2]):
-            if ri[li + 4 * link + 3] == 0:
+            if ri[li + 4 * link + 3] >= 0:
                 best = min(best, _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, best))
         world[n] = best
         gap = _INF
@@ -436,20 +440,23 @@ def sphere_clearances(q, rf, ri, D, E, wf, C, plane, which, field):
     """
     place_spheres(q, rf, ri, C)
     ro = ri[17] + 3 * ri[1]
-    for s in range(ri[1]):
-        x = C[0, s]
-        y = C[1, s]
-        z = C[2, s]
-        r = rf[ro + s]
-        plane[s] = _INF
-        which[s] = -1
-        for p in range(int(wf[5])):
-            o = 7 + 4 * p
-            d = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3] - r
-            if d < plane[s]:
-                plane[s] = d
-                which[s] = p
-        field[s] = field_bound(D, E, wf, x, y, z, _INF, True) - r
+    for link in range(ri[2]):
+        li = ri[9] + 4 * link
+        rule = max(ri[li + 3], 0)
+        for s in range(ri[li + 1], ri[li + 2]):
+            x = C[0, s]
+            y = C[1, s]
+            z = C[2, s]
+            r = rf[ro + s]
+            plane[s] = _INF
+            which[s] = -1
+            for p in range(int(wf[5])):
+                o = 7 + 4 * p
+                d = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3] - r
+                if d < plane[s]:
+                    plane[s] = d
+                    which[s] = p
+            field[s] = field_bound(D, E, wf, rule, x, y, z, _INF, True) - r
 
 
 @njit(cache=True, nogil=True)
@@ -527,7 +534,7 @@ def _safe_span(q, rf, ri, D, E, wf, link_rate, pair_rate, longest, T, lc, C, pla
     li = ri[9]
     span = longest
     for link in range(ri[2] - 1, -1, -1):
-        if ri[li + 4 * link + 3] != 0:
+        if ri[li + 4 * link + 3] < 0:
             continue
         rate = link_rate[link]
         c = _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, margin + span * rate) - margin
@@ -622,3 +629,93 @@ def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
         hi[depth + 1] = b
         depth += 2
     return True
+
+
+@njit(cache=True, nogil=True)
+def check_path(P, rf, ri, D, E, wf, min_motion, stats):
+    """Index of the first edge of P (n, dof) that is in collision, or -1; see `check_motion`.
+
+    stats (4,): of the refused edge. A single configuration counts as an edge to itself.
+    """
+    for e in range(max(P.shape[0] - 1, 1)):
+        if not check_motion(
+            P[e], P[min(e + 1, P.shape[0] - 1)], rf, ri, D, E, wf, min_motion, stats
+        ):
+            return e
+    return -1
+
+
+@njit(cache=True, nogil=True)
+def _edge_delta(qa, qb, ri, delta):
+    """Fill delta (dof,): the way from qa to qb, continuous joints the short way round."""
+    for j in range(ri[4]):
+        d = qb[j] - qa[j]
+        if ri[ri[11] + j] != 0:
+            d -= 2.0 * np.pi * np.round(d / (2.0 * np.pi))
+        delta[j] = d
+
+
+@njit(cache=True, nogil=True)
+def count_steps(P, rf, ri, spacing, steps):
+    """Fill steps (n - 1,) so that no sphere centre moves more than `spacing` metres in one
+    step of an edge; return their sum."""
+    delta = np.empty(ri[4])
+    link_rate = np.empty(ri[2])
+    pair_rate = np.empty(ri[3])
+    total = 0
+    for e in range(P.shape[0] - 1):
+        _edge_delta(P[e], P[e + 1], ri, delta)
+        motion_rates(delta, rf, ri, link_rate, pair_rate)
+        fastest = 0.0
+        for link in range(ri[2]):
+            fastest = max(fastest, link_rate[link])
+        steps[e] = max(1, int(np.ceil(fastest / spacing)))
+        total += steps[e]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def place_path(P, steps, rf, ri, C, slack):
+    """Sample a path: C (n, 3, S) sphere centres, and slack (n, S) that covers the gaps.
+
+    Between two samples a centre is nowhere farther than its slack from one of them: half
+    the chord, and a quarter of (joint angle turned) x (path length) for the bend. For the
+    second derivative of a centre along the edge is a sum over pairs of joints of
+    |dq_f| |dq_g| |dC/dq_g|, at most twice the product of the two, and a curve leaves its
+    chord by at most an eighth of that.
+    """
+    dof = ri[4]
+    q = np.empty(dof)
+    delta = np.empty(dof)
+    link_rate = np.empty(ri[2])
+    pair_rate = np.empty(ri[3])
+    slack[:] = 0.0
+    i = 0
+    for e in range(P.shape[0] - 1):
+        _edge_delta(P[e], P[e + 1], ri, delta)
+        motion_rates(delta, rf, ri, link_rate, pair_rate)
+        turned = 0.0
+        for f in range(1, ri[0]):
+            if ri[ri[8] + 3 * f + 1] == 1:
+                value = rf[ri[16] + 14 * f + 12] * delta[ri[ri[8] + 3 * f + 2]]
+                turned += abs(value) / steps[e]
+        for t in range(steps[e] + 1):
+            for j in range(dof):
+                q[j] = P[e, j] + (t / steps[e]) * delta[j]
+            if t > 0 or e == 0:
+                place_spheres(q, rf, ri, C[i + t])
+            if t == 0:
+                continue
+            for link in range(ri[2]):
+                bend = 0.25 * turned * link_rate[link] / steps[e]
+                li = ri[9] + 4 * link
+                for s in range(ri[li + 1], ri[li + 2]):
+                    chord = 0.0
+                    for k in range(3):
+                        chord += (C[i + t, k, s] - C[i + t - 1, k, s]) ** 2
+                    way = 0.5 * np.sqrt(chord) + bend
+                    slack[i + t - 1, s] = max(slack[i + t - 1, s], way)
+                    slack[i + t, s] = max(slack[i + t, s], way)
+        i += steps[e]
+    if P.shape[0] == 1:
+        place_spheres(P[0], rf, ri, C[0])

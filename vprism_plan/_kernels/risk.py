@@ -227,43 +227,96 @@ def touch_each(
 
 
 @njit(cache=True, nogil=True)
+def _nearest_owner(owner_row, owners, counts, s, x, y, z, low, high):
+    """Object class of an occupied voxel of draw s at a distance in [low, high] from a voxel,
+    the nearest one; 0 if there is none. Voxels."""
+    nx, ny, nz = owner_row.shape
+    wide = int(high) + 1
+    best = np.inf
+    found = 0
+    for a in range(max(x - wide, 0), min(x + wide + 1, nx)):
+        for b in range(max(y - wide, 0), min(y + wide + 1, ny)):
+            flat = (a - x) ** 2 + (b - y) ** 2
+            if flat > high * high:
+                continue
+            for c in range(max(z - wide, 0), min(z + wide + 1, nz)):
+                away = flat + (c - z) ** 2
+                if low * low <= away < best and away <= high * high:
+                    row = owner_row[a, b, c]
+                    if row >= 0 and counts[owners[row, s]]:
+                        best = away
+                        found = owners[row, s]
+    return found
+
+
+@njit(cache=True, nogil=True)
 def causes(
-    C, slack, radii, rules, first_sample, counts, owner_row, owners, first, spacing,
-    sphere, owner,
+    C, slack, radii, rules, distance_row, rows, first, spacing, scale, reach, first_sample,
+    counts, owner_row, owners, owner_first, sphere, owner,
 ):  # fmt: skip
     """Which ball touched first in each draw, and whose voxel: sphere (S,), owner (S,).
 
-    Of the balls that touch at the draw's first sample, the one that reaches deepest: whose
-    occupied voxel is nearest to its centre, less its radius. counts (g, 256): the classes
-    that count under each rule. -1 and 0 where no draw touches, or nothing was found.
+    Of the balls that touch at the draw's first sample, the one that reaches deepest into
+    what is nearest to it. counts (g, 256): the classes that count under each rule. -1 and
+    0 where no draw touches. Everything asked about must be baked.
     """
-    nx, ny, nz = owner_row.shape
+    _, ex, ey, ez = distance_row.shape
     for s in range(owners.shape[1]):
         sphere[s] = -1
         owner[s] = 0
         i = first_sample[s]
         if i < 0:
             continue
-        deepest = np.inf
+        deepest = -np.inf
         for j in range(C.shape[2]):
             if rules[j] < 0:
                 continue
-            x = C[i, 0, j] / spacing - first[0]
-            y = C[i, 1, j] / spacing - first[1]
-            z = C[i, 2, j] / spacing - first[2]
-            ball = (radii[j] + slack[i, j]) / spacing
-            wide = ball + 1.7320509  # the voxel nearest to the centre may be this much nearer
-            for a in range(max(int(x - wide), 0), min(int(x + wide) + 2, nx)):
-                for b in range(max(int(y - wide), 0), min(int(y + wide) + 2, ny)):
-                    flat = (a - x) ** 2 + (b - y) ** 2
-                    if flat > wide * wide:
-                        continue
-                    for c in range(max(int(z - wide), 0), min(int(z + wide) + 2, nz)):
-                        row = owner_row[a, b, c]
-                        if row < 0:
-                            continue
-                        depth = np.sqrt(flat + (c - z) ** 2) - ball
-                        if depth < deepest and counts[rules[j], owners[row, s]]:
-                            deepest = depth
-                            sphere[s] = j
-                            owner[s] = owners[row, s]
+            gx = C[i, 0, j] / spacing - first[0]
+            gy = C[i, 1, j] / spacing - first[1]
+            gz = C[i, 2, j] / spacing - first[2]
+            if not (-0.5 < gx < ex - 0.5 and -0.5 < gy < ey - 0.5 and -0.5 < gz < ez - 0.5):
+                continue
+            x = int(gx + 0.5)
+            y = int(gy + 0.5)
+            z = int(gz + 0.5)
+            row = distance_row[rules[j], x, y, z]
+            if row < 0:
+                continue
+            need = (radii[j] + slack[i, j]) / spacing
+            need += np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+            value = rows[row, s]
+            limit = np.uint8(need * scale) if need < reach else NOTHING
+            if value > limit or need * scale - value <= deepest:
+                continue
+            deepest = need * scale - value
+            sphere[s] = j
+            high = (value + 1) / scale if value != NOTHING else reach
+            owner[s] = _nearest_owner(
+                owner_row, owners, counts[rules[j]], s,
+                x + first[0] - owner_first[0], y + first[1] - owner_first[1],
+                z + first[2] - owner_first[2], max(value / scale - 1e-9, 0.0), high,
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def volume_codes(C, chosen, radii, rules, codes, origin, spacing, totals):
+    """Add the balls' volume to totals (4,) by the code of the space it lies in; 3 is outside.
+
+    C (n, 3, m): only the samples `chosen` count. Seven points per ball.
+    """
+    nx, ny, nz = codes.shape
+    for i in chosen:
+        for j in range(C.shape[2]):
+            if rules[j] < 0:
+                continue
+            weight = radii[j] ** 3 / 7.0
+            for p in range(7):
+                offset = 0.0 if p == 0 else (0.6 if p % 2 else -0.6) * radii[j]
+                axis = (p - 1) // 2
+                x = int(np.floor((C[i, 0, j] + offset * (axis == 0) - origin[0]) / spacing + 0.5))
+                y = int(np.floor((C[i, 1, j] + offset * (axis == 1) - origin[1]) / spacing + 0.5))
+                z = int(np.floor((C[i, 2, j] + offset * (axis == 2) - origin[2]) / spacing + 0.5))
+                if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+                    totals[codes[x, y, z]] += weight
+                else:
+                    totals[3] += weight

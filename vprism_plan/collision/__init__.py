@@ -6,5 +6,15 @@ from vprism_plan.collision.config import CheckerConfig as CheckerConfig
 from vprism_plan.collision.reports import Contact as Contact
 from vprism_plan.collision.reports import MotionReport as MotionReport
 from vprism_plan.collision.reports import StateReport as StateReport
+from vprism_plan.collision.risk import FirstContact as FirstContact
+from vprism_plan.collision.risk import RiskEstimate as RiskEstimate
 
-__all__ = ["CheckerConfig", "CollisionChecker", "Contact", "MotionReport", "StateReport"]
+__all__ = [
+    "CheckerConfig",
+    "CollisionChecker",
+    "Contact",
+    "FirstContact",
+    "MotionReport",
+    "RiskEstimate",
+    "StateReport",
+]

@@ -4,7 +4,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.collision.protocols import Answers
+from vprism_plan.collision.protocols import Answers, BakedWorld, NodeField, RuledWorld
 from vprism_plan.collision.reports import Contact, Kind, StateReport
 
 _STATUS_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
@@ -41,6 +41,7 @@ def explain(checker: Answers, q: Float[np.ndarray, "dof"]) -> StateReport:
     if not valid:
         contacts = [*_world_contacts(checker, q), *_self_contacts(checker, q), *limits]
         contacts.sort(key=lambda contact: -contact.depth)
+        contacts += checker.risk_contacts(q)
     return StateReport(
         valid=valid,
         contacts=tuple(contacts),
@@ -49,6 +50,7 @@ def explain(checker: Answers, q: Float[np.ndarray, "dof"]) -> StateReport:
         margin=checker.config.margin,
         shares=volume_shares(checker, q),
         policies=policies,
+        allowed=tuple(_allowed_contacts(checker, q)),
     )
 
 
@@ -109,7 +111,7 @@ def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
             kind: Kind = "support" if body == "support surface" else "known"
             keep(_contact(kind, robot.link_names[link], body, margin - plane[s], s, point, row[:3]))
         if not field[s] > margin:
-            body, normal = nearest_source(checker, centers[s])
+            body, normal = nearest_source(world, checker.verdict_field(link), centers[s])
             kind = _kind_of(body)
             point = centers[s] - radius * normal
             sure = None
@@ -173,16 +175,40 @@ def _policy_detail(checker: Answers, kind: Kind) -> str:
     return ""
 
 
+def _allowed_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+    """Return the deepest contact of each link with each object that it may touch."""
+    robot, world = checker.robot, checker.world
+    if not isinstance(world, RuledWorld) or not any(
+        checker.allowed_objects(link) for link in range(len(robot.link_names))
+    ):
+        return []
+    centers = checker.sphere_clearances(q)[0]
+    deepest: dict[tuple[int, int], Contact] = {}
+    for s, center in enumerate(centers):
+        link, radius = int(robot.sphere_links[s]), float(robot.sphere_radii[s])
+        if robot.arrays.link_fixed[link]:
+            continue
+        for object_id in sorted(checker.allowed_objects(link)):
+            field = world.object_field(object_id)
+            depth = radius - float(field.lower_bound(center[None])[0])
+            kept = deepest.get((link, object_id))
+            if depth < 0.0 or (kept is not None and kept.depth >= depth):
+                continue
+            _, normal = nearest_source(world, field, center)
+            deepest[link, object_id] = _contact(
+                "object", robot.link_names[link], f"object:{object_id}", depth, s,
+                center - radius * normal, normal, None, "allowed",
+            )  # fmt: skip
+    return list(deepest.values())
+
+
 def nearest_source(
-    checker: Answers, point: Float[np.ndarray, "3"]
+    world: BakedWorld, field: NodeField, point: Float[np.ndarray, "3"]
 ) -> tuple[str, Float[np.ndarray, "3"]]:
     """Return the name of the obstacle nearest to a point and the direction away from it."""
-    field = checker.world.field
     shape = np.array(field.distance.shape)
     g = (point - field.origin) / field.spacing
-    outside = checker.world.config.unobserved == "occupied" and (
-        np.any(g < 0) or np.any(g > shape - 1)
-    )
+    outside = world.config.unobserved == "occupied" and (np.any(g < 0) or np.any(g > shape - 1))
     inside = np.clip(g, 0.0, shape - 1.0)
     cell = np.minimum(inside.astype(int), shape - 2)
     corners = cell + np.indices((2, 2, 2)).reshape(3, -1).T
@@ -195,14 +221,8 @@ def nearest_source(
         gradient = inside - g
     length = float(np.linalg.norm(gradient))
     normal = gradient / length if np.isfinite(length) and length > 0 else np.array([0.0, 0.0, 1.0])
-    name = "unobserved" if outside else world_source_name(checker, nearest)
+    name = "unobserved" if outside else world.sources[int(field.source[tuple(nearest)])]
     return name, normal
-
-
-def world_source_name(checker: Answers, node: np.ndarray) -> str:
-    """Return the name of the obstacle that a node of the field is nearest to."""
-    world = checker.world
-    return world.sources[int(world.field.source[tuple(node)])]
 
 
 def _self_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:

@@ -6,12 +6,13 @@ coordinate axis costs half of a general one) and bounds how far each joint can c
 each link, which is what the continuous edge check advances by.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision.protocols import BakedWorld
+from vprism_plan.collision.protocols import BakedWorld, NodeField, SphereRobot
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
 
@@ -28,11 +29,11 @@ class PackedRobot:
 
 @dataclass(frozen=True)
 class PackedWorld:
-    """Kernel view of a world: distances at nodes and in blocks (metres, float32), and the
-    grid, plane and margin data."""
+    """Kernel view of a world: distances at nodes and in blocks (metres, float32) for each
+    contact rule, and the grid, plane and margin data."""
 
-    distance: Float[np.ndarray, "nx ny nz"]
-    blocks: Float[np.ndarray, "bx by bz"]
+    distance: Float[np.ndarray, "g nx ny nz"]
+    blocks: Float[np.ndarray, "g bx by bz"]
     floats: Float[np.ndarray, "w"]
 
 
@@ -59,6 +60,20 @@ def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
     joint = int(arrays.q_index[frame])
     ends = arrays.q_mult[frame] * np.array([arrays.lower[joint], arrays.upper[joint]])
     return float(np.max(np.abs(ends + arrays.q_offset[frame])))
+
+
+def require_prismatic_limits(robot: SphereRobot, rows: Float[np.ndarray, "n dof"]) -> None:
+    """Raise RobotError if a prismatic joint leaves its limits: its motion has no bound there."""
+    arrays = robot.arrays
+    for joint in np.unique(arrays.q_index[arrays.kind == 2]):
+        values = rows[:, joint]
+        low, high = arrays.lower[joint], arrays.upper[joint]
+        bad = np.flatnonzero((values < low) | (values > high))
+        if len(bad):
+            raise RobotError(
+                f"prismatic joint {robot.joint_names[joint]} is {values[bad[0]]:.4f} m, outside "
+                f"its limits [{low:.4f}, {high:.4f}]; ask inside them"
+            )
 
 
 def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
@@ -111,12 +126,18 @@ def _frame_floats(arrays: KinematicArrays) -> tuple[np.ndarray, list[np.ndarray]
     return frames, turned
 
 
-def pack_robot(arrays: KinematicArrays, self_margin: float = 0.0) -> PackedRobot:
+def pack_robot(
+    arrays: KinematicArrays,
+    self_margin: float = 0.0,
+    rules: Int[np.ndarray, "l"] | None = None,
+) -> PackedRobot:
     """Pack a robot's kinematics, spheres and pairs for the kernels.
 
     Args:
         arrays: Flat description of the robot.
         self_margin: Gap, metres, that link pairs must keep beyond touching.
+        rules: Which of the packed world's fields each link is checked against; None is
+            the first for all. Links that no joint moves are checked against none.
 
     Raises:
         RobotError: A prismatic joint has no finite limits, so its motion has no bound.
@@ -157,7 +178,9 @@ def pack_robot(arrays: KinematicArrays, self_margin: float = 0.0) -> PackedRobot
     ]
     frame_ints = np.column_stack([arrays.parent, arrays.kind, np.maximum(arrays.q_index, 0)])
     starts, ends = arrays.link_start[:-1], arrays.link_start[1:]
-    link_ints = np.column_stack([arrays.link_frame, starts, ends, arrays.link_fixed.astype(int)])
+    rules = np.zeros(n_links, dtype=np.int64) if rules is None else rules
+    rules = np.where(arrays.link_fixed, -1, rules)
+    link_ints = np.column_stack([arrays.link_frame, starts, ends, rules])
     int_parts = [frame_ints, link_ints, arrays.pairs, arrays.continuous.astype(np.int64)]
     header = np.zeros(_HEADER, dtype=np.int64)
     header[:5] = n_frames, len(spheres), n_links, len(arrays.pairs), len(arrays.lower)
@@ -188,13 +211,19 @@ def block_bounds(
     return np.ascontiguousarray(np.nextafter(bounds, np.float32(-np.inf)))
 
 
-def pack_world(world: BakedWorld, margin: float) -> PackedWorld:
-    """Pack a baked world for the kernels; `margin` (metres) is the clearance to keep."""
-    field = world.field
+def pack_world(world: BakedWorld, fields: Sequence[NodeField], margin: float) -> PackedWorld:
+    """Pack a baked world for the kernels; `margin` (metres) is the clearance to keep.
+
+    Args:
+        world: Whose half-spaces and policies count.
+        fields: One per contact rule, all on the same nodes.
+        margin: Metres.
+    """
+    field = fields[0]
     planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
     outside = 1.0 if world.config.unobserved == "occupied" else 0.0
     head = [*np.asarray(field.origin, dtype=np.float64), float(field.spacing), outside]
     floats = np.array([*head, float(len(planes)), float(margin), *planes.reshape(-1)])
-    distance = np.ascontiguousarray(field.distance, dtype=np.float32)
-    blocks = block_bounds(distance, float(field.spacing))
+    distance = np.ascontiguousarray([f.distance for f in fields], dtype=np.float32)
+    blocks = np.ascontiguousarray([block_bounds(d, float(field.spacing)) for d in distance])
     return PackedWorld(distance=distance, blocks=blocks, floats=floats)

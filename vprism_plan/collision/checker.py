@@ -1,17 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The collision checker: a robot's spheres against a world that knows what it has not seen."""
 
+import threading
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan._kernels import checking as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.collision import _explain
-from vprism_plan.collision._packing import pack_robot, pack_world
+from vprism_plan.collision._packing import pack_robot, pack_world, require_prismatic_limits
+from vprism_plan.collision._path_risk import PathRisk
 from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.protocols import BakedWorld, Numbers, SphereRobot
-from vprism_plan.collision.reports import MotionReport, StateReport
-from vprism_plan.errors import RobotError
+from vprism_plan.collision.contacts import contact_rules
+from vprism_plan.collision.protocols import (
+    BakedWorld,
+    NodeField,
+    Numbers,
+    RuledWorld,
+    SphereRobot,
+)
+from vprism_plan.collision.reports import Contact, MotionReport, StateReport
+from vprism_plan.collision.risk import RiskEstimate
+from vprism_plan.errors import ConfigError, RobotError
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
@@ -38,6 +49,9 @@ class CollisionChecker:
     distances are lower bounds, so an error can only refuse. Links that no joint moves
     are not checked against the world: they stand on it.
 
+    `config.allowed_contacts` lets links touch chosen objects; `config.max_risk` replaces the
+    level set by a bound on the probability of collision (see `CheckerConfig`).
+
     Construction compiles the kernels if they are not cached on disk (some twenty seconds,
     once per machine). Safe to share between threads; the kernels release the GIL.
     Single queries cost a microsecond or two of compiled code: O(frames + links), plus
@@ -55,12 +69,25 @@ class CollisionChecker:
         self.world = world
         self.robot = robot
         self.config = CheckerConfig() if config is None else config
-        packed = pack_robot(robot.arrays, self.config.self_margin)
-        baked = pack_world(world, self.config.margin)
+        rules = contact_rules(robot, self.config.allowed_contacts)
+        self._rules, self._link_rules = rules
+        packed = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
         self._rf, self._ri = packed.floats, packed.ints
-        self._D, self._E, self._wf = baked.distance, baked.blocks, baked.floats
+        self._fields = [world.field]
+        self._fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
+        baked = pack_world(world, self._fields, self.config.margin)
+        # What `clearance` is measured to; verdicts are given by `_world`.
+        self._surfaces = baked.distance, baked.blocks, baked.floats
+        self._world = self._surfaces
         self._dof = robot.dof
         self._shape = (robot.dof,)
+        self._slides = bool((robot.arrays.kind == 2).any())
+        self._lock = threading.Lock()
+        self._path_risk: PathRisk | None = None
+        self._bounded: PathRisk | None = None  # set when verdicts need it
+        if self.config.max_risk is not None:
+            self._bounded = self._risk()
+            self._fields, self._world = self._bounded.fields, self._bounded.packed
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -85,16 +112,19 @@ class CollisionChecker:
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        return kernels.is_valid(
-            self._configuration(q), self._rf, self._ri, self._D, self._E, self._wf
-        )
+        return self.is_valid_buffer(self._configuration(q))
 
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
         """`is_valid` without looking at the shape: q must be a contiguous float64 (dof,) array.
 
         The path for planners' inner loops.
         """
-        return kernels.is_valid(q, self._rf, self._ri, self._D, self._E, self._wf)
+        if self._bounded is None:
+            return kernels.is_valid(q, self._rf, self._ri, *self._world)
+        return (
+            kernels.is_valid(q, self._rf, self._ri, *self._world)
+            and self._bounded.hits_at(q) <= self._bounded.allowed
+        )
 
     def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
         """Return `is_valid` for each row of Q (n, dof); runs on all worker threads."""
@@ -102,9 +132,10 @@ class CollisionChecker:
         out = np.empty(len(Q), dtype=np.bool_)
 
         def work(part: slice) -> None:
-            kernels.is_valid_batch(
-                Q[part], self._rf, self._ri, self._D, self._E, self._wf, out[part]
-            )
+            kernels.is_valid_batch(Q[part], self._rf, self._ri, *self._world, out[part])
+            if self._bounded is not None:
+                left = part.start + np.flatnonzero(out[part])
+                out[left] = self._bounded.hits_each(Q[left]) <= self._bounded.allowed
 
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return out
@@ -114,7 +145,9 @@ class CollisionChecker:
 
         Negative when a sphere reaches into the level set, the table, known geometry or
         whatever else the world's policies make an obstacle. The margin is not
-        subtracted, and self-collision and joint limits do not enter.
+        subtracted, and self-collision and joint limits do not enter. It is measured to the
+        level set also when `max_risk` decides what is valid; a link's allowed contacts do
+        not count.
 
         Raises:
             RobotError: q does not have shape (dof,) or is not finite.
@@ -123,7 +156,7 @@ class CollisionChecker:
         if not np.isfinite(q).all():
             raise RobotError(f"configuration is {q.tolist()}; clearance needs finite joint values")
         world, own = np.empty(1), np.empty(1)
-        kernels.clearance_batch(q[None], self._rf, self._ri, self._D, self._E, self._wf, world, own)
+        kernels.clearance_batch(q[None], self._rf, self._ri, *self._surfaces, world, own)
         return float(world[0])
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
@@ -141,7 +174,8 @@ class CollisionChecker:
         It is covered by conservative advancement on the clearances, with every link's
         displacement bounded from the kinematic chain. Where clearance is so small that
         the steps fall below `config.min_motion`, it samples: an accepted edge is free
-        up to `config.tolerance` metres of motion.
+        up to `config.tolerance` metres of motion. With `max_risk`, the worlds that collide
+        anywhere on the edge must be few enough, too.
 
         Raises:
             RobotError: An end does not have shape (dof,).
@@ -159,10 +193,14 @@ class CollisionChecker:
         qa, qb = self._configuration(qa), self._configuration(qb)
         stats = np.empty(4)
         valid = self._check_motion(qa, qb, stats)
-        fraction = None if valid else float(stats[0])
-        state = None
-        if fraction is not None:
+        fraction: float | None = None
+        state = risk = None
+        if not valid and stats[0] >= 0.0:
+            fraction = float(stats[0])
             state = self.explain(interpolate(self.robot, qa, qb, fraction))
+        elif not valid:
+            edge = np.stack([qa, qb])
+            risk, fraction = self._risk().estimate(edge), self._risk().exceeded_at(edge)
         return MotionReport(
             valid=valid,
             certified=valid and bool(stats[2] <= _ROUNDING),
@@ -171,7 +209,54 @@ class CollisionChecker:
             configurations=int(stats[1]),
             motion_bound=float(stats[3]),
             state=state,
+            risk=risk,
         )
+
+    def collision_probability(self, path: Numbers) -> RiskEstimate:
+        """Return the probability that a path (or a configuration) touches anything.
+
+        The share of worlds, drawn from the map's posterior, in which any sphere of any
+        moving link comes within `config.margin` of an occupied voxel that it may not touch,
+        or of a certain obstacle, anywhere on the path: the same world for the whole path.
+        Edges are straight in joint space and swept without gaps. Self-collision and joint
+        limits do not enter.
+
+        Args:
+            path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
+
+        Raises:
+            RobotError: a wrong shape, a value that is not finite, or a prismatic joint
+                outside its limits (no bound on the motion holds there).
+        """
+        array = np.ascontiguousarray(path, dtype=np.float64)
+        rows = array[None] if array.ndim == 1 else array
+        if rows.ndim != 2 or rows.shape[1] != self._dof or len(rows) == 0:
+            raise RobotError(
+                f"path has shape {array.shape}; {self.robot.name} needs (T, {self._dof}) or "
+                f"({self._dof},): {', '.join(self.robot.joint_names)}"
+            )
+        if not np.isfinite(rows).all():
+            row = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
+            raise RobotError(f"waypoint {row} is {rows[row].tolist()}; give finite joint values")
+        if self._slides:
+            require_prismatic_limits(self.robot, rows)
+        return self._risk().estimate(rows)
+
+    def _ruled_world(self) -> RuledWorld:
+        if not isinstance(self.world, RuledWorld):
+            raise ConfigError(
+                f"probabilities and allowed contacts need a vprism_plan.World; "
+                f"{type(self.world).__name__} has no posterior and no fields per object"
+            )
+        return self.world
+
+    def _risk(self) -> PathRisk:
+        with self._lock:
+            if self._path_risk is None:
+                self._path_risk = PathRisk(
+                    self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
+                )
+            return self._path_risk
 
     def explain(self, q: Numbers) -> StateReport:
         """Return the verdict on a configuration with every reason that refuses it.
@@ -180,6 +265,21 @@ class CollisionChecker:
             RobotError: q does not have shape (dof,).
         """
         return _explain.explain(self, self._configuration(q))
+
+    def verdict_field(self, link: int) -> NodeField:
+        """Return the distance field that verdicts check a link (index) against."""
+        return self._fields[int(self._link_rules[link])]
+
+    def allowed_objects(self, link: int) -> frozenset[int]:
+        """Return the ids of the objects that a link (index) may touch."""
+        return self._rules[int(self._link_rules[link])]
+
+    def risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
+        """Return what makes a configuration too risky; empty if it is not, or has no bound."""
+        bounded = self._bounded
+        if bounded is None or bounded.hits_at(q) <= bounded.allowed:
+            return ()
+        return bounded.contacts(q)
 
     def sphere_clearances(
         self, q: Float[np.ndarray, "dof"]
@@ -193,9 +293,7 @@ class CollisionChecker:
         n = int(self._ri[1])
         centers, plane, field = np.empty((3, n)), np.empty(n), np.empty(n)
         which = np.empty(n, dtype=np.int64)
-        kernels.sphere_clearances(
-            q, self._rf, self._ri, self._D, self._E, self._wf, centers, plane, which, field
-        )
+        kernels.sphere_clearances(q, self._rf, self._ri, *self._world, centers, plane, which, field)
         return np.ascontiguousarray(centers.T), plane, which, field
 
     def pair_gaps(self, q: Float[np.ndarray, "dof"]) -> tuple[np.ndarray, np.ndarray]:
@@ -206,9 +304,12 @@ class CollisionChecker:
         return gaps, spheres
 
     def _check_motion(self, qa: np.ndarray, qb: np.ndarray, stats: np.ndarray) -> bool:
-        return kernels.check_motion(
-            qa, qb, self._rf, self._ri, self._D, self._E, self._wf, self.config.min_motion, stats
+        free = kernels.check_motion(
+            qa, qb, self._rf, self._ri, *self._world, self.config.min_motion, stats
         )
+        if not free or self._bounded is None:
+            return free
+        return self._bounded.hits(np.stack([qa, qb])) <= self._bounded.allowed
 
     def _clearances(self, Q: Numbers) -> tuple[np.ndarray, np.ndarray]:
         Q = self._configurations(Q)
@@ -221,7 +322,7 @@ class CollisionChecker:
 
         def work(part: slice) -> None:
             kernels.clearance_batch(
-                Q[part], self._rf, self._ri, self._D, self._E, self._wf, world[part], own[part]
+                Q[part], self._rf, self._ri, *self._surfaces, world[part], own[part]
             )
 
         run_chunked(work, len(Q), _BATCH_CHUNK)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What "free" means for one checker."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,10 +22,16 @@ class CheckerConfig:
             this, metres, between two checked configurations. A point of such a gap is
             at most half of it away from a configuration known to be free: that half
             is the tolerance of `check_motion`.
-        max_risk: Bound on the probability of collision; only None (no bound) is
-            accepted by this version.
-        allowed_contacts: Contacts to permit, link to object ids; only an empty mapping
-            is accepted by this version.
+        max_risk: Bound on the probability of collision. With a bound, the objects of the
+            map (and occluded space where the map has support) are judged by worlds drawn
+            from its posterior instead of by the level set: a configuration or an edge is
+            free if the upper confidence bound of its probability of collision is within
+            `max_risk`. Everything else is refused as without a bound. None: level set.
+        allowed_contacts: Link or SRDF group -> ids of the objects it may touch; for
+            example {"hand": {3}}. What a link may touch, it may also pass through.
+        n_worlds: Worlds drawn for probabilities, a multiple of 64.
+        risk_seed: Seed of the draws.
+        confidence: Of the interval of a probability, two-sided.
     """
 
     margin: float = 0.0
@@ -33,6 +39,9 @@ class CheckerConfig:
     min_motion: float = 0.002
     max_risk: float | None = None
     allowed_contacts: Mapping[str, Any] = field(default_factory=dict)
+    n_worlds: int = 256
+    risk_seed: int = 0
+    confidence: float = 0.95
 
     def __post_init__(self) -> None:
         """Refuse values that would make a verdict meaningless."""
@@ -44,18 +53,43 @@ class CheckerConfig:
             raise ConfigError(
                 f"min_motion is {self.min_motion!r}; it must be finite and at least 1e-5 metres"
             )
-        if self.max_risk is not None:
+        if self.max_risk is not None and not 0.0 < self.max_risk < 1.0:
             raise ConfigError(
-                f"max_risk is {self.max_risk!r}; this version has no chance constraints, "
-                "so leave it None and use margin (metres) to keep away from surfaces"
+                f"max_risk is {self.max_risk!r}; it must be a probability strictly between 0 "
+                "and 1, or None for no bound"
             )
-        if self.allowed_contacts:
+        if self.n_worlds < 64 or self.n_worlds % 64:
             raise ConfigError(
-                f"allowed_contacts names {sorted(map(str, self.allowed_contacts))}; this version "
-                "has no contact rules, so leave it empty"
+                f"n_worlds is {self.n_worlds!r}; it must be a positive multiple of 64"
             )
+        if self.risk_seed < 0:
+            raise ConfigError(f"risk_seed is {self.risk_seed!r}; it must be at least 0")
+        if not 0.0 < self.confidence < 1.0:
+            raise ConfigError(
+                f"confidence is {self.confidence!r}; it must be strictly between 0 and 1"
+            )
+        object.__setattr__(self, "allowed_contacts", _checked_contacts(self.allowed_contacts))
 
     @property
     def tolerance(self) -> float:
         """How far, metres of motion, an accepted edge may be from a checked free point."""
         return 0.5 * self.min_motion
+
+
+def _checked_contacts(contacts: Any) -> dict[str, frozenset[int]]:
+    """Link or group to a set of object ids; ConfigError if it is not that."""
+    if not isinstance(contacts, Mapping):
+        raise ConfigError(
+            f"allowed_contacts is a {type(contacts).__name__}; it must map a link or group to "
+            'object ids, for example {"hand": {3}}'
+        )
+    checked = {}
+    for name, ids in contacts.items():
+        whole = isinstance(ids, Collection) and not isinstance(ids, str)
+        if not (whole and all(isinstance(i, (int, np.integer)) for i in ids)):
+            raise ConfigError(
+                f"allowed_contacts[{name!r}] is {ids!r}; it must be a set of object ids (whole "
+                "numbers), for example {3}"
+            )
+        checked[str(name)] = frozenset(int(i) for i in ids)
+    return checked

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a checker needs of a world and of a robot: anything that has it can be checked."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -75,6 +75,28 @@ class BakedWorld(Protocol):
 
     def status(self, points: np.ndarray) -> np.ndarray:
         """(N,) codes: 0 seen, 1 occluded, 2 unobserved, 3 outside the grid."""
+        ...
+
+
+@runtime_checkable
+class RuledWorld(BakedWorld, Protocol):
+    """A baked world that knows its objects apart and its posterior's draws: what contact
+    rules and probabilities need; see `vprism_plan.world.World`."""
+
+    def fields_without(self, object_ids: Collection[int]) -> NodeField:
+        """Combined field without some objects."""
+        ...
+
+    def object_field(self, object_id: int) -> Any:
+        """Distance to one object alone."""
+        ...
+
+    def certain_field(self, without: Collection[int] = ()) -> NodeField:
+        """Distance to what is an obstacle whatever the posterior says."""
+        ...
+
+    def posterior_worlds(self, n_worlds: int, seed: int, reach: float) -> Any:
+        """Joint draws of the map; see `vprism_plan.world.PosteriorWorlds`."""
         ...
 
 
@@ -156,6 +178,18 @@ class Answers(Protocol):
 
     def self_clearance_batch(self, Q: Numbers) -> np.ndarray:
         """(n,) smallest gaps between links, metres."""
+        ...
+
+    def verdict_field(self, link: int) -> NodeField:
+        """Field that a link is checked against."""
+        ...
+
+    def allowed_objects(self, link: int) -> frozenset[int]:
+        """Ids of the objects that a link may touch."""
+        ...
+
+    def risk_contacts(self, q: np.ndarray) -> tuple[Any, ...]:
+        """What refuses a configuration because its risk is above the bound."""
         ...
 
     def sphere_clearances(

@@ -4,6 +4,8 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from vprism_plan.collision.risk import RiskEstimate
+
 Kind = Literal[
     "object",
     "support",
@@ -11,6 +13,7 @@ Kind = Literal[
     "occluded",
     "unobserved",
     "known",
+    "risk",
     "self",
     "joint_limit",
     "not_finite",
@@ -37,12 +40,14 @@ class Contact:
         body: Name of what is touched: "object:3", "table", "background", "occluded",
             another link, or the limit.
         depth: How far the clearance falls short of what is required, metres (for a
-            joint limit: how far outside, radians or metres).
+            joint limit: how far outside, radians or metres; for a risk: by how much its
+            upper bound exceeds `max_risk`).
         sphere: Index of the collision sphere, or -1.
         position: Point of contact, world frame, metres.
         normal: Unit direction that leads out of the contact, world frame.
-        probability: Largest P(occupied) of the map inside the sphere; None where the
-            cause is not the map's to judge (self, limits, known geometry).
+        probability: Largest P(occupied) of the map inside the sphere (for a risk: the
+            share of the posterior worlds in which this link touches this body); None where
+            the cause is not the map's to judge (self, limits, known geometry).
         detail: The rule that decided, in words.
     """
 
@@ -60,6 +65,11 @@ class Contact:
         """Return the reason as one phrase."""
         if self.kind in {"joint_limit", "not_finite"}:
             return self.detail
+        if self.kind == "risk":
+            return (
+                f"{self.link} touches {self.body} with probability {self.probability:.2f} "
+                f"({self.detail})"
+            )
         at = ""
         if self.position is not None:
             at = " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
@@ -98,6 +108,7 @@ class StateReport:
         shares: Share of the robot's sphere volume that lies in space that is "occluded",
             "unobserved" or "outside" the grid: what nobody has seen.
         policies: What the world does with those spaces ("occupied", "free", "posterior").
+        allowed: Contacts that the rules permit: links that touch objects they may touch.
     """
 
     valid: bool
@@ -107,13 +118,17 @@ class StateReport:
     margin: float
     shares: dict[str, float] = field(default_factory=dict)
     policies: dict[str, str] = field(default_factory=dict)
+    allowed: tuple[Contact, ...] = ()
 
     def text(self) -> str:
         """Return the verdict in one line."""
         if self.valid:
             unseen = ", ".join(f"{k} {100 * v:.0f}%" for k, v in self.shares.items() if v > 0.005)
-            return f"free, clearance {1000 * self.clearance:.1f} mm" + (
-                f"; volume not seen: {unseen}" if unseen else ""
+            touching = ", ".join(f"{c.link} touches {c.body}" for c in self.allowed)
+            return (
+                f"free, clearance {1000 * self.clearance:.1f} mm"
+                + (f"; allowed: {touching}" if touching else "")
+                + (f"; volume not seen: {unseen}" if unseen else "")
             )
         return "; ".join(contact.text() for contact in self.contacts)
 
@@ -133,6 +148,7 @@ class StateReport:
             "margin": self.margin,
             "shares": dict(self.shares),
             "policies": dict(self.policies),
+            "allowed": [contact.to_dict() for contact in self.allowed],
         }
 
 
@@ -151,6 +167,7 @@ class MotionReport:
         configurations: How many configurations were checked.
         motion_bound: Upper bound of any sphere's path length along the edge, metres.
         state: Report of the refused configuration; None when valid.
+        risk: Estimate along the edge, when `max_risk` is what refused it.
     """
 
     valid: bool
@@ -160,11 +177,14 @@ class MotionReport:
     configurations: int
     motion_bound: float
     state: StateReport | None = None
+    risk: RiskEstimate | None = None
 
     def text(self) -> str:
         """Return the verdict in one line."""
         if self.valid:
             how = "certified" if self.certified else f"to within {1000 * self.tolerance:.2f} mm"
             return f"free ({how}, {self.configurations} configurations)"
+        if self.risk is not None:
+            return f"too risky: {self.risk.text()}"
         reason = "" if self.state is None else f": {self.state.text()}"
         return f"in collision at {self.collision_fraction:.3f} of the edge{reason}"
