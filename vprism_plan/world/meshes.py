@@ -48,7 +48,7 @@ def extract_meshes(
         if len(map.object_ids) > 1:
             others = np.delete(probabilities, (0, k), axis=-1).max(axis=-1)
             inside = np.minimum(occupied, probabilities[..., k] - others)
-        mesh = _surface(inside, origin, resolution)
+        mesh = surface(inside, origin, resolution)
         if mesh is None:
             _log.warning(
                 "object %d has no surface at level %g on a grid of %g m: left out",
@@ -69,7 +69,7 @@ def extract_union_mesh(
     Arguments, guarantees and errors as for `extract_meshes`.
     """
     probabilities, origin = _sample(map, level, resolution)
-    mesh = _surface(probabilities[..., 1:].sum(axis=-1) - level, origin, resolution)
+    mesh = surface(probabilities[..., 1:].sum(axis=-1) - level, origin, resolution)
     if mesh is None:
         _log.warning("no object reaches level %g on a grid of %g m", level, resolution)
     return mesh
@@ -103,7 +103,7 @@ def _sample(
     return probabilities.reshape(*shape, -1), resolution * first
 
 
-def _surface(
+def surface(
     inside: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, " 3"], resolution: float
 ) -> "trimesh.Trimesh | None":
     """Surface {inside = 0} around {inside > 0}; None if there is none.

@@ -96,11 +96,11 @@ def _fill_inside(
             continue
         box = first[region - 1]
         where = np.argwhere(regions[box] == region)[0] + [s.start for s in box]
-        if abs(_winding_number(origin + spacing * where, triangles)) > 0.5:
+        if abs(winding_number(origin + spacing * where, triangles)) > 0.5:
             labels[regions == region] = 1
 
 
-def _winding_number(point: Float[np.ndarray, " 3"], triangles: Float[np.ndarray, "f 3 3"]) -> float:
+def winding_number(point: Float[np.ndarray, " 3"], triangles: Float[np.ndarray, "f 3 3"]) -> float:
     """How often a closed surface winds round a point: its solid angle over 4 pi.
 
     Van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), eq. 8.
