@@ -19,11 +19,14 @@ class PrimitiveGeometry:
         size: Metres. Box: the three edge lengths; cylinder: radius and length;
             sphere: radius.
         T_link: Pose of the solid in its link's frame, (4, 4).
+        padding: Metres by which the solid is grown all around: it is every point at most so
+            far from the shape of ``size``, so its edges are round.
     """
 
     kind: Literal["box", "cylinder", "sphere"]
     size: tuple[float, ...]
     T_link: Float[np.ndarray, "4 4"]
+    padding: float = 0.0
 
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Exact signed distance of points to the solid.
@@ -36,7 +39,7 @@ class PrimitiveGeometry:
         """
         local = (points - self.T_link[:3, 3]) @ self.T_link[:3, :3]
         if self.kind == "sphere":
-            return np.linalg.norm(local, axis=1) - self.size[0]
+            return np.linalg.norm(local, axis=1) - self.size[0] - self.padding
         if self.kind == "box":
             excess = np.abs(local) - 0.5 * np.asarray(self.size)
         else:
@@ -44,12 +47,12 @@ class PrimitiveGeometry:
             radial = np.linalg.norm(local[:, :2], axis=1) - radius
             excess = np.stack([radial, np.abs(local[:, 2]) - 0.5 * length], axis=1)
         outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
-        return outside + np.minimum(excess.max(axis=1), 0.0)
+        return outside + np.minimum(excess.max(axis=1), 0.0) - self.padding
 
     def bounding_radius(self) -> float:
         """Radius in metres of the ball around the solid's centre that holds it."""
         if self.kind == "sphere":
-            return self.size[0]
+            return self.size[0] + self.padding
         if self.kind == "box":
-            return float(0.5 * np.linalg.norm(self.size))
-        return float(np.hypot(self.size[0], 0.5 * self.size[1]))
+            return float(0.5 * np.linalg.norm(self.size)) + self.padding
+        return float(np.hypot(self.size[0], 0.5 * self.size[1])) + self.padding

@@ -70,6 +70,14 @@ def pairs_touching(
     return touching
 
 
+def touching_pairs(
+    arrays: KinematicArrays, q: Float[np.ndarray, "dof"], names: Sequence[str]
+) -> set[tuple[str, str]]:
+    """Names of the tested pairs whose spheres overlap at one configuration."""
+    touching = pairs_touching(arrays, q[None], arrays.pairs)[0]
+    return {(names[a], names[b]) for a, b in arrays.pairs[touching]}
+
+
 def random_configurations(
     arrays: KinematicArrays, n: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "n dof"]:

@@ -70,21 +70,21 @@ def lock_values(
     return values
 
 
-def rigid_pose(pose: ArrayLike) -> Float[np.ndarray, "4 4"]:
+def rigid_pose(pose: ArrayLike, what: str = "base_pose") -> Float[np.ndarray, "4 4"]:
     """A copy of a pose, refused unless it is a proper rigid motion."""
     try:
         T = np.array(pose, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise RobotError(f"base_pose is not a (4, 4) array: {error}") from error
+        raise RobotError(f"{what} is not a (4, 4) array: {error}") from error
     if T.shape != (4, 4):
-        raise RobotError(f"base_pose has shape {T.shape}; expected (4, 4)")
+        raise RobotError(f"{what} has shape {T.shape}; expected (4, 4)")
     if not np.isfinite(T).all():
-        raise RobotError("base_pose holds NaN or infinite values; give a rigid 4x4 pose")
+        raise RobotError(f"{what} holds NaN or infinite values; give a rigid 4x4 pose")
     R = T[:3, :3]
     drift = float(np.abs(R @ R.T - np.eye(3)).max())
     if drift > 1e-6 or np.linalg.det(R) < 0 or not np.array_equal(T[3], [0, 0, 0, 1]):
         raise RobotError(
-            f"base_pose is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
+            f"{what} is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
             f"determinant {np.linalg.det(R):.6g} (expected 1) and last row {T[3].tolist()} "
             "(expected [0, 0, 0, 1])"
         )

@@ -146,11 +146,11 @@ def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
         (n, 4) rows (x, y, z, radius) in the link's frame, metres.
     """
     if solid.kind == "sphere":
-        return np.array([[*solid.T_link[:3, 3], solid.size[0]]])
+        return np.array([[*solid.T_link[:3, 3], solid.size[0] + solid.padding]])
     local = _tile_cylinder(*solid.size) if solid.kind == "cylinder" else _tile_box(solid.size)
     local[:, :3] = local[:, :3] @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
     # Rounding in the transform must not open a gap at the corners.
-    local[:, 3] *= 1.0 + 1e-9
+    local[:, 3] = local[:, 3] * (1.0 + 1e-9) + solid.padding
     return local
 
 

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Padding and scale: by how much links grow, and that spheres still hold the solids."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles.kinematics_oracle import random_pose
+from test_sphere_enclosure import gap, interior, spheres_of, surface
+
+from vprism_plan.collision import CollisionChecker
+from vprism_plan.collision._packing import pack_robot
+from vprism_plan.errors import RobotError
+from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def well_formed(robot: Robot) -> None:
+    """What kernels rely on: links contiguous, radii falling, balls that hold their links."""
+    a = robot.arrays
+    for link in range(len(robot.link_names)):
+        rows = slice(a.link_start[link], a.link_start[link + 1])
+        assert (a.sphere_link[rows] == link).all()
+        assert (a.sphere_frame[rows] == a.link_frame[link]).all()
+        assert (np.diff(a.sphere_radius[rows]) <= 0).all()
+        reach = np.linalg.norm(a.sphere_center[rows] - a.link_center[link], axis=1)
+        assert (reach + a.sphere_radius[rows] <= a.link_radius[link]).all()
+    assert a.link_start[-1] == len(robot.sphere_radii) == len(a.sphere_center)
+    assert (a.pairs[:, 0] < a.pairs[:, 1]).all()
+    assert a.pairs.max(initial=-1) < len(robot.link_names)
+    for name, value in vars(a).items():
+        assert value.flags.c_contiguous, name
+    assert pack_robot(a).floats.dtype == np.float64
+
+
+def padded_surface(solid: PrimitiveGeometry, spacing: float) -> np.ndarray:
+    """Points of a padded solid's surface, outer ones included: its core's, pushed outward."""
+    core = surface(PrimitiveGeometry(solid.kind, solid.size, solid.T_link), spacing)
+    i = np.arange(32) + 0.5
+    polar, turn = np.arccos(1 - 2 * i / 32), np.pi * (1 + 5**0.5) * i
+    ball = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], 1)
+    return (core[:, None] + solid.padding * ball).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5e", "planar3"])
+def test_padding_adds_exactly_that_many_metres_to_every_radius(robots, name):
+    robot = robots[name]
+    padded = robot.with_padding(0.0125)
+    np.testing.assert_array_equal(padded.sphere_radii, robot.sphere_radii + 0.0125)
+    q = torch.tensor(robot.random_configuration(np.random.default_rng(0)))
+    assert torch.equal(padded.sphere_centers(q), robot.sphere_centers(q))
+    assert padded.reach == pytest.approx(robot.reach + 0.0125)
+    well_formed(padded)
+
+
+def test_no_padding_and_scale_one_change_no_bit(robots):
+    for robot in robots.values():
+        same = robot.with_padding()
+        for name, value in vars(robot.arrays).items():
+            np.testing.assert_array_equal(getattr(same.arrays, name), value)
+        assert same.geometry.keys() == robot.geometry.keys()
+
+
+def test_padding_of_links_and_groups(robots):
+    panda = robots["panda"]
+    table = {"hand": 0.01, "fingers": 0.02, "panda_leftfinger": 0.005}
+    padded = panda.with_padding(table)
+    added = padded.sphere_radii - panda.sphere_radii
+    expected = {"panda_hand": 0.01, "panda_rightfinger": 0.02, "panda_leftfinger": 0.005}
+    for link, name in enumerate(panda.link_names):
+        np.testing.assert_allclose(added[panda.sphere_links == link], expected.get(name, 0.0))
+    reverse = dict(reversed(table.items()))
+    np.testing.assert_array_equal(panda.with_padding(reverse).sphere_radii, padded.sphere_radii)
+    twice = panda.with_padding(0.01).with_padding({"hand": 0.01})
+    hand = np.isin(panda.sphere_links, [panda.link_names.index(n) for n in panda.links_of("hand")])
+    np.testing.assert_allclose(twice.sphere_radii, panda.sphere_radii + 0.01 + 0.01 * hand)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"padding": -0.01}, r"padding of all links is -0.01; .* 0 or more"),
+        ({"padding": {"hand": -1e-9}}, r"padding of 'hand' is -1e-09"),
+        ({"padding": {"panda_hand": np.nan}}, r"padding of 'panda_hand' is nan"),
+        ({"padding": np.inf}, "padding of all links is inf"),
+        ({"scale": {"panda_link3": 0.0}}, r"scale of 'panda_link3' is 0.0; .* above 0"),
+        ({"scale": -1.0}, "scale of all links is -1.0"),
+        ({"padding": {"wrist": 0.01}}, r"'wrist' is no link or group of panda"),
+        ({"scale": {"panda_link8": 1.1}}, r"'panda_link8' has no collision spheres"),
+    ],
+)
+def test_bad_values_are_refused_by_link(robots, options, message):
+    with pytest.raises(RobotError, match=message):
+        robots["panda"].with_padding(**options)
+
+
+@pytest.mark.parametrize(
+    ("name", "scale"), [("panda", 0.8), ("panda", 1.3), ("ur5e", 1.0), ("planar3", 2.0)]
+)
+def test_scaled_spheres_hold_the_scaled_solids_and_what_they_held_before(robots, name, scale):
+    robot = robots[name]
+    grown = robot.with_padding(0.01, scale=scale)
+    well_formed(grown)
+    assert (grown.sphere_radii > 0).all()
+    for link, solids in grown.geometry.items():
+        spheres = spheres_of(grown, link)
+        for solid, before in zip(solids, robot.geometry[link], strict=True):
+            assert solid.padding == 0.01
+            np.testing.assert_allclose(solid.size, scale * np.array(before.size))
+            assert gap(spheres, padded_surface(solid, 0.02)).max() <= 1e-12
+            if scale >= 1.0:
+                assert gap(spheres, surface(before, 0.008)).max() <= -0.01 + 1e-9
+
+
+@settings(max_examples=40)
+@given(seed=seeds, scale=st.floats(1.0, 3.0))
+def test_a_scale_above_one_never_uncovers_a_point(seed, scale):
+    """Links with elbows, too: each sphere is held by the one it becomes."""
+    from vprism_plan.robots._padding import _scaled
+
+    rng = np.random.default_rng(seed)
+    centers, radii = rng.normal(size=(6, 3)) * 0.2, rng.uniform(0.005, 0.15, 6)
+    about = rng.normal(size=3) * 0.1
+    after, big = _scaled(centers, radii, about, scale)
+    image = about + scale * (centers - about)
+    assert (np.linalg.norm(after - centers, axis=1) + radii <= big + 1e-12).all()
+    assert (np.linalg.norm(after - image, axis=1) + scale * radii <= big + 1e-12).all()
+    # and no larger than that needs
+    least = np.maximum(
+        scale * radii, (np.linalg.norm(image - centers, axis=1) + (1 + scale) * radii) / 2
+    )
+    np.testing.assert_allclose(big, least, rtol=1e-9)
+
+
+@given(kind=st.sampled_from(["box", "cylinder", "sphere"]), padding=st.floats(0.0, 0.1), seed=seeds)
+def test_a_padded_solid_is_the_points_that_near_to_it(kind, padding, seed):
+    rng = np.random.default_rng(seed)
+    size = tuple(rng.uniform(0.01, 0.3, {"box": 3, "cylinder": 2, "sphere": 1}[kind]).tolist())
+    core = PrimitiveGeometry(kind, size, random_pose(rng))
+    solid = PrimitiveGeometry(kind, size, core.T_link, padding=padding)
+    points = core.T_link[:3, 3] + rng.normal(size=(300, 3)) * max(size)
+    np.testing.assert_allclose(
+        solid.signed_distance(points), core.signed_distance(points) - padding, atol=1e-12
+    )
+    assert solid.bounding_radius() == pytest.approx(core.bounding_radius() + padding)
+    spheres = enclosing_spheres(solid)
+    rim = padded_surface(solid, max(size) / 4)
+    assert gap(spheres, np.vstack([rim, interior(solid, 300, rng)])).max() <= 1e-12
+
+
+def test_clearance_falls_by_exactly_the_padding(demo_world, ball_robot):
+    robot = ball_robot(0.02)
+    rng = np.random.default_rng(0)
+    Q = np.column_stack([rng.uniform(-0.4, 0.4, (200, 2)), rng.uniform(0.05, 0.6, 200)])
+    bare = CollisionChecker(demo_world, robot).clearance_batch(Q)
+    padded = CollisionChecker(demo_world, robot.with_padding({"ball": 0.017})).clearance_batch(Q)
+    np.testing.assert_allclose(padded, bare - 0.017, atol=1e-9)
+
+
+def test_links_that_padding_makes_touch_are_named(robots, caplog):
+    with caplog.at_level(logging.WARNING):
+        robots["panda"].with_padding(0.005)
+    assert not caplog.records
+    with caplog.at_level(logging.WARNING):
+        padded = robots["panda"].with_padding(0.1)
+    assert "padding makes links touch" in caplog.text
+    assert len(padded.collision_pairs) == len(robots["panda"].collision_pairs)
+
+
+def test_links_without_spheres_keep_their_solids(write):
+    from small_urdfs import TWO
+
+    spheres = {"a": [], "b": [{"center": [0.1, 0, 0], "radius": 0.1}], "c": []}
+    robot = Robot.from_urdf(write(TWO), spheres=spheres)
+    grown = robot.with_padding(0.01, scale=2.0)
+    assert grown.geometry["a"] is robot.geometry["a"]
+    assert grown.geometry["b"][0].size == (0.1,)
+    # about the middle of the link's spheres, not about its frame
+    np.testing.assert_allclose(grown.geometry["b"][0].T_link[:3, 3], [-0.1, 0, 0])
+
+
+def test_the_robot_asked_is_left_alone(robots):
+    panda = robots["panda"]
+    before = panda.sphere_radii.copy()
+    panda.with_padding(0.05, scale=1.3)
+    np.testing.assert_array_equal(panda.sphere_radii, before)
+    moved = panda.with_padding(0.02).with_base_pose(random_pose(np.random.default_rng(0)))
+    np.testing.assert_array_equal(moved.sphere_radii, before + 0.02)

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Objects that a robot carries: one more link, which moves with another."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.errors import RobotError
+from vprism_plan.robots._arrays import KinematicArrays
+from vprism_plan.robots._frames import Attachment, bounding_ball
+from vprism_plan.robots._mesh_spheres import mesh_spheres, read_triangles
+from vprism_plan.robots._self_collision import touching_pairs
+from vprism_plan.robots._setup import rigid_pose
+from vprism_plan.robots._torch_kinematics import TorchKinematics
+
+_logger = logging.getLogger(__name__)
+
+
+def attached(
+    robot: Any,
+    name: str,
+    link: str,
+    rows: Float[np.ndarray, "n 4"],
+    pose: Any,
+    touch_links: Sequence[str],
+) -> Any:
+    """See :meth:`Robot.attach`; ``rows`` are the object's spheres in its own frame."""
+    what = described(name)
+    if not isinstance(name, str) or not name or name in robot._links or name in robot.groups:
+        raise RobotError(f"{what}: an object needs a name of its own, no link's or group's")
+    if link not in robot._links:
+        raise RobotError(f"{what}: no link {link!r}; links: {sorted(robot._links)}")
+    if isinstance(touch_links, str):
+        raise RobotError(f"{what}: touch_links is the string {touch_links!r}; give a sequence")
+    T = np.eye(4) if pose is None else rigid_pose(pose, f"{what}: pose")
+    carrier = robot._links[link]
+    sits = Attachment(carrier.frame, carrier.T @ T)
+    siblings = [other for other, parent in robot.attached.items() if parent == link]
+    reasons = dict.fromkeys(siblings, "Attached to the same link") | {link: "Attached"}
+    for touched in (member for entry in touch_links for member in _members(robot, entry)):
+        reasons.setdefault(touched, "Touch link")
+    untested = [i for i, other in enumerate(robot.link_names) if other in reasons]
+    arrays = with_link(robot.arrays, sits, rows, untested)
+    names = (*robot.link_names, name)
+    touching = [p for p in touching_pairs(arrays, robot.neutral, names) if name in p]
+    if touching:
+        _logger.warning(
+            "%s touches links in the neutral state: %s; if it may, name them in touch_links",
+            what,
+            sorted(touching),
+        )
+    return dataclasses.replace(
+        robot,
+        link_names=names,
+        disabled_pairs=robot.disabled_pairs
+        | {frozenset((name, other)): reason for other, reason in reasons.items()},
+        arrays=arrays,
+        attached=robot.attached | {name: link},
+        _links=robot._links | {name: sits},
+        _torch=TorchKinematics(arrays),
+    )
+
+
+def detached(robot: Any, name: str) -> Any:
+    """See :meth:`Robot.detach`."""
+    if name not in robot.attached:
+        raise RobotError(f"{name!r} is not attached; attached: {sorted(robot.attached)}")
+    carried = [other for other, parent in robot.attached.items() if parent == name]
+    if carried:
+        raise RobotError(f"{name!r} carries {carried}; detach them first")
+    arrays = without_link(robot.arrays, robot.link_names.index(name))
+    return dataclasses.replace(
+        robot,
+        link_names=tuple(link for link in robot.link_names if link != name),
+        disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if name not in p},
+        arrays=arrays,
+        attached={other: link for other, link in robot.attached.items() if other != name},
+        _links={link: sits for link, sits in robot._links.items() if link != name},
+        _torch=TorchKinematics(arrays),
+    )
+
+
+def described(name: str) -> str:
+    """How messages call an object."""
+    return f"attached object {name!r}"
+
+
+def object_spheres(
+    name: str, spheres: Any, mesh: Any, max_spheres: int
+) -> Float[np.ndarray, "n 4"]:
+    """Rows (x, y, z, radius) from whichever of the two is given.
+
+    Raises:
+        RobotError: Neither or both are given, or what is given is unusable.
+    """
+    what = described(name)
+    if (spheres is None) == (mesh is None):
+        raise RobotError(f"{what}: give either spheres or a mesh")
+    if mesh is None:
+        return sphere_rows(spheres, what)
+    if max_spheres < 1:
+        raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
+    return mesh_spheres(read_triangles(mesh, what), max_spheres)
+
+
+def _members(robot: Any, name: str) -> tuple[str, ...]:
+    """Links of a link or group, with or without spheres."""
+    if name in robot._links:
+        return (name,)
+    return tuple(robot.groups[name] if name in robot.groups else robot.links_of(name))
+
+
+def with_link(
+    arrays: KinematicArrays,
+    sits: Attachment,
+    rows: Float[np.ndarray, "n 4"],
+    untested: Iterable[int],
+) -> KinematicArrays:
+    """Add a link at the end: spheres ``rows`` in its own frame, which sits at ``sits``.
+
+    It is tested against every link whose index is not in ``untested``.
+    """
+    rows = rows[np.argsort(-rows[:, 3], kind="stable")]
+    local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
+    center, radius = bounding_ball(local, rows[:, 3])
+    index, left_out = len(arrays.link_frame), set(untested)
+    added = [(other, index) for other in range(index) if other not in left_out]
+    pairs = np.vstack([arrays.pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
+    return dataclasses.replace(
+        arrays,
+        sphere_frame=np.append(arrays.sphere_frame, np.full(len(rows), sits.frame)),
+        sphere_center=np.vstack([arrays.sphere_center, local]),
+        sphere_radius=np.append(arrays.sphere_radius, rows[:, 3]),
+        sphere_link=np.append(arrays.sphere_link, np.full(len(rows), index)),
+        link_start=np.append(arrays.link_start, len(arrays.sphere_radius) + len(rows)),
+        link_frame=np.append(arrays.link_frame, sits.frame),
+        link_center=np.vstack([arrays.link_center, center]),
+        link_radius=np.append(arrays.link_radius, radius),
+        link_fixed=np.append(arrays.link_fixed, sits.frame == 0),
+        pairs=np.ascontiguousarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]),
+    )
+
+
+def without_link(arrays: KinematicArrays, link: int) -> KinematicArrays:
+    """Take a link's spheres and pairs away; links after it move up by one."""
+    kept = arrays.sphere_link != link
+    count = int(arrays.link_start[link + 1] - arrays.link_start[link])
+    owner = arrays.sphere_link[kept]
+    start = np.delete(arrays.link_start, link + 1)
+    start[link + 1 :] -= count
+    pairs = arrays.pairs[(arrays.pairs != link).all(axis=1)]
+    return dataclasses.replace(
+        arrays,
+        sphere_frame=arrays.sphere_frame[kept],
+        sphere_center=np.ascontiguousarray(arrays.sphere_center[kept]),
+        sphere_radius=arrays.sphere_radius[kept],
+        sphere_link=owner - (owner > link),
+        link_start=start,
+        link_frame=np.delete(arrays.link_frame, link),
+        link_center=np.ascontiguousarray(np.delete(arrays.link_center, link, axis=0)),
+        link_radius=np.delete(arrays.link_radius, link),
+        link_fixed=np.delete(arrays.link_fixed, link),
+        pairs=np.ascontiguousarray(pairs - (pairs > link)),
+    )
+
+
+def sphere_rows(spheres: object, what: str) -> Float[np.ndarray, "n 4"]:
+    """Spheres as an array of rows (x, y, z, radius).
+
+    Raises:
+        RobotError: There are none, or one is not four finite numbers with a positive radius.
+    """
+    try:
+        rows = np.array(spheres, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RobotError(
+            f"{what}: spheres are not rows (x, y, z, radius) in metres: {error}"
+        ) from error
+    if rows.ndim != 2 or rows.shape[1] != 4 or len(rows) == 0:
+        raise RobotError(
+            f"{what}: spheres have shape {rows.shape}; give at least one row (x, y, z, radius)"
+        )
+    bad = np.flatnonzero(~(np.isfinite(rows).all(axis=1) & (rows[:, 3] > 0.0)))
+    if len(bad):
+        raise RobotError(
+            f"{what}: sphere {int(bad[0])} is {rows[bad[0]].tolist()}; centre and radius must be "
+            "finite and the radius positive (metres)"
+        )
+    return rows
