@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Counts the posterior worlds in which a robot collides."""
 
+import copy
 import dataclasses
 from collections import Counter
 from collections.abc import Collection, Sequence
@@ -23,6 +24,8 @@ from vprism_plan.collision.risk import (
 )
 
 _FIRST = np.zeros(1, np.int64)
+_PADDINGS = (0.5, 1.0, 2.0)  # voxels by which spheres grow when no world may collide any more
+_HELD_OUT = 1_000_003  # added to the seed of the draws
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,9 +75,11 @@ class PathRisk:
         self._radii = arrays.sphere_radius + config.margin
         largest = float(np.max(self._radii[moving], initial=0.0))
         resolution = float(world.field.spacing)
-        # Room for a voxel and a half (the centre's offset, and the way between samples).
+        # Room for a voxel and a half (the centre's offset, and the way between samples), and
+        # for what `tightened` adds.
+        room = 2.5 if config.max_risk is None else 2.5 + _PADDINGS[-1]
         self.worlds = world.posterior_worlds(
-            config.n_worlds, config.risk_seed, reach=largest + 2.5 * resolution
+            config.n_worlds, config.risk_seed, reach=largest + room * resolution
         )
         self.spacing = min(resolution, 0.5 * world.map.kernel_length)
         self._table_of = np.array([self.worlds.rule(ids) for ids in rules], dtype=np.int64)
@@ -97,11 +102,35 @@ class PathRisk:
         self._lower = np.maximum(self._lower - self.worlds.error_occupied, 0.0)
         self._upper = np.minimum(self._upper + self.worlds.error_free, 1.0)
         self._codes: SpaceCodes | None = None
+        self._held_out: PathRisk | None = None
         self.allowed = 0
         if config.max_risk is not None:
             self.allowed = tolerated_hits(config.max_risk, self._upper, config.n_worlds)
             for ids in rules:
                 self.worlds.bake(without=ids)
+
+    def tightened(self, level: int) -> "PathRisk | None":
+        """Return the same with a stricter bound on verdicts, None if there is none left.
+
+        Halves the worlds that may collide, down to none, then grows the spheres by half, one
+        and two voxels. What the stricter one accepts, this one accepts.
+        """
+        stricter = copy.copy(self)
+        halvings = self.allowed.bit_length()  # after so many, none is left
+        stricter.allowed = self.allowed >> min(level, halvings)
+        if level > halvings:
+            if level - halvings > len(_PADDINGS):
+                return None
+            stricter._radii = self._radii + _PADDINGS[level - halvings - 1] * self.worlds.resolution
+        return stricter
+
+    def held_out(self) -> "PathRisk":
+        """Return the same with worlds that no verdict has seen."""
+        if self._held_out is None:
+            other = copy.copy(self)
+            other.worlds = self.worlds.redrawn(self.worlds.seed + _HELD_OUT)
+            self._held_out = other
+        return self._held_out
 
     # --- counting ----------------------------------------------------------------------
     def sweep(self, path: Float[np.ndarray, "t dof"]) -> Sweep:

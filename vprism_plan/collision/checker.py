@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The collision checker: a robot's spheres against a world that knows what it has not seen."""
 
+import copy
 import threading
 
 import numpy as np
@@ -212,7 +213,32 @@ class CollisionChecker:
             risk=risk,
         )
 
-    def collision_probability(self, path: Numbers) -> RiskEstimate:
+    @property
+    def max_risk(self) -> float | None:
+        """Bound on the probability of collision of what is valid, or None."""
+        return self.config.max_risk
+
+    def tightened(self, level: int) -> "CollisionChecker | None":
+        """Return a checker with a stricter bound on risk; None if there is no stricter one.
+
+        Each edge of a path may be within `max_risk` and the path still above it. Level by
+        level fewer worlds may collide with an edge, then none, then the spheres grow by up
+        to two voxels. Everything is shared with this checker, whose verdicts include those
+        of the stricter one.
+
+        Raises:
+            ConfigError: this checker has no `max_risk`.
+        """
+        if self._bounded is None:
+            raise ConfigError("max_risk is None; only a bound on risk can be tightened")
+        bounded = self._bounded.tightened(level)
+        if bounded is None:
+            return None
+        stricter = copy.copy(self)
+        stricter._bounded = bounded
+        return stricter
+
+    def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
         """Return the probability that a path (or a configuration) touches anything.
 
         The share of worlds, drawn from the map's posterior, in which any sphere of any
@@ -223,6 +249,9 @@ class CollisionChecker:
 
         Args:
             path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
+            held_out: ask other worlds than those that `max_risk` is checked with. A path
+                that a planner found with this checker was selected by the worlds it was
+                checked with, so their verdict on it is too mild.
 
         Raises:
             RobotError: a wrong shape, a value that is not finite, or a prismatic joint
@@ -240,7 +269,8 @@ class CollisionChecker:
             raise RobotError(f"waypoint {row} is {rows[row].tolist()}; give finite joint values")
         if self._slides:
             require_prismatic_limits(self.robot, rows)
-        return self._risk().estimate(rows)
+        risk = self._risk()
+        return (risk.held_out() if held_out else risk).estimate(rows)
 
     def _ruled_world(self) -> RuledWorld:
         if not isinstance(self.world, RuledWorld):

@@ -73,6 +73,21 @@ class CheckerLike(Protocol):
 
 
 @runtime_checkable
+class RiskChecker(CheckerLike, Protocol):
+    """A checker that bounds the probability of collision."""
+
+    @property
+    def max_risk(self) -> float | None:
+        """Bound on the probability of collision, None for no bound."""
+
+    def collision_probability(self, path: Any, held_out: bool = False) -> Any:
+        """A `RiskEstimate` of a path (T, dof); `held_out`: by worlds no verdict has seen."""
+
+    def tightened(self, level: int) -> Any:
+        """The same checker with a stricter bound, None if there is none."""
+
+
+@runtime_checkable
 class SecondOpinion(Protocol):
     """Another judge of paths, see `vprism_plan.collision.MeshChecker`."""
 

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._protocol import CheckerLike, SecondOpinion
 from vprism_plan.planning._query import configuration, refuse, search_request, valid_goals
+from vprism_plan.planning._risk import with_allowed_contacts, within_risk
 from vprism_plan.planning._runtime import MAX_SEED
 from vprism_plan.planning._search import SearchRequest, search
 from vprism_plan.planning._second_opinion import refuse_unfit, reviewed
@@ -48,7 +49,10 @@ def plan(
 
     Start and goal are checked first. The path found is shortened, optionally resampled,
     and then every edge of the returned array is checked again with
-    `checker.check_motion`. Exceptions raised by the checker propagate.
+    `checker.check_motion`. If the checker bounds the probability of collision
+    (`max_risk`), the whole path is then judged at once, by worlds the search has not seen;
+    a path that is too risky as a whole is searched for again under a tighter bound on its
+    edges, as long as the time limit allows. Exceptions raised by the checker propagate.
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
@@ -99,18 +103,20 @@ def plan(
     goals = valid_goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
     if isinstance(goals, PlanResult):
         return goals
-    report = replace(report, state_checks=1 + len(goals))
-
+    report = replace(report, state_checks=1 + len(goals), motion_checks=len(goals))
     finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step)
-    direct = _direct(checker, q_start, goals)
-    report = replace(report, motion_checks=len(goals))
-    if direct is not None:
-        index, path = direct
-        report = replace(report, direct=True, goal_index=index)
-        result = verified(checker, finish.resampled(checker, path), clearance_step, report)
-    else:
-        result = _searched(checker, q_start, goals, request, finish, report)
-    return reviewed(result, checker, second_opinion)
+
+    def attempt(judge: CheckerLike, limit: float, number: int) -> PlanResult:
+        direct = _direct(judge, q_start, goals)
+        if direct is not None:
+            path = finish.resampled(judge, direct[1])
+            found = replace(report, direct=True, goal_index=direct[0])
+            return verified(judge, path, clearance_step, found)
+        other = replace(request, time_limit=limit, seed=_other_seed(request.seed, 64 * number))
+        return _searched(judge, q_start, goals, other, finish, report)
+
+    result = within_risk(checker, attempt, request.time_limit)
+    return reviewed(with_allowed_contacts(result, checker), checker, second_opinion)
 
 
 @dataclass(frozen=True)
@@ -165,7 +171,7 @@ def _searched(
         left = request.time_limit - report.planning_time
         if left <= 0.0:
             break
-        seed = (request.seed + attempt * _SEED_STRIDE) % (MAX_SEED + 1)
+        seed = _other_seed(request.seed, attempt)
         found = search(checker, start, goals, replace(request, seed=seed, time_limit=left))
         report = replace(
             report,
@@ -190,6 +196,11 @@ def _searched(
     if refused is None:
         raise PlanningError(f"time_limit {request.time_limit} s left no time for a search")
     return refused
+
+
+def _other_seed(seed: int, number: int) -> int:
+    """Return the seed of a further search; number 0 is the given one."""
+    return (seed + number * _SEED_STRIDE) % (MAX_SEED + 1)
 
 
 def _direct(

@@ -7,7 +7,13 @@ from typing import Any, Literal
 import numpy as np
 
 Status = Literal[
-    "exact", "approximate", "timeout", "invalid_start", "invalid_goal", "verification_failed"
+    "exact",
+    "approximate",
+    "timeout",
+    "invalid_start",
+    "invalid_goal",
+    "verification_failed",
+    "too_risky",
 ]
 
 
@@ -47,6 +53,13 @@ class PlanReport:
             with `MeshChecker` a `PathOpinion` that says who disagrees, where and why);
             None if nobody was asked or there is no path.
         second_opinion_time: seconds that took.
+        risk: joint probability that the path collides, by worlds the search has not seen
+            (a `RiskEstimate`); None if the checker has no `max_risk`, or without a path.
+        risk_levels: how often the bound was tightened because a path was within it edge by
+            edge, but not as a whole.
+        risk_time: seconds spent on those estimates.
+        allowed_contacts: contacts that the rules permit, at the last waypoint: what the
+            robot ends touching (`Contact`s).
     """
 
     planner: str
@@ -69,6 +82,10 @@ class PlanReport:
     shares: dict[str, float] = field(default_factory=dict)
     second_opinion: Any = None
     second_opinion_time: float = 0.0
+    risk: Any = None
+    risk_levels: int = 0
+    risk_time: float = 0.0
+    allowed_contacts: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -82,11 +99,13 @@ class PlanResult:
             whole turns of those joints.
         status: "exact" (path reaches the goal and every edge was re-verified),
             "approximate" (ended near the goal only), "timeout" (nothing found),
-            "invalid_start", "invalid_goal", "verification_failed".
+            "invalid_start", "invalid_goal", "verification_failed", "too_risky" (every edge
+            is within `max_risk`, the whole path is not).
         report: the numbers.
         message: one line for people: what happened and why.
         approximate_path: waypoints that do NOT solve the query: of an approximate
-            solution, or those that failed verification. None otherwise.
+            solution, those that failed verification, or the least risky ones that are too
+            risky. None otherwise.
         explanation: the checker's `explain` report for an invalid start or goal, or its
             `check_motion_report` for the first edge that failed verification, None
             otherwise.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Possible worlds: joint draws from a map's posterior, ready to be asked for collisions."""
 
+import copy
 import threading
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -124,6 +125,28 @@ class PosteriorWorlds:
             f"PosteriorWorlds(n_worlds={self.n_worlds}, seed={self.seed}, "
             f"drawn_voxels={len(self._voxels)}, nbytes={self.nbytes})"
         )
+
+    def redrawn(self, seed: int) -> "PosteriorWorlds":
+        """Return as many other worlds of the same map, with nothing baked yet.
+
+        Shares what does not depend on the draws. A path that was chosen because few of these
+        worlds object to it is judged fairly only by worlds that had no say in the choice.
+        """
+        other = copy.copy(self)
+        other.seed = seed
+        other._draws = Draws(self.map, self.n_worlds, seed)
+        other._owners = self._owners.copy()
+        other._drawn = np.diff(self._block_start) == 0
+        with self._lock:
+            other._rules = list(self._rules)
+        other._tables = Tables(
+            np.repeat(self._grown[None], len(other._rules), axis=0),
+            np.empty((0, self.n_worlds), np.uint8),
+            np.empty(0, np.uint8),
+            np.empty(0, np.uint8),
+        )
+        other._lock = threading.RLock()
+        return other
 
     # --- what is where ---------------------------------------------------------------
     def owners(self, index: Int[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n s"]:
