@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Clearance over whole edges, and how far a motion stays safe: bounds, not samples."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.collision._travel import checked_tolerance, edges_of, motion_bounds
+from vprism_plan.collision.protocols import Numbers
+from vprism_plan.collision.reports import StateReport
+
+_BATCH = 64  # configurations asked at once where clearance is too small to step by
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class PathClearance:
+    """Answer of `min_clearance`.
+
+    Attributes:
+        clearance: lower bound of the distance to the world at every point of the path,
+            edges included, metres.
+        tolerance: the smallest clearance of any configuration on the path lies at most
+            this much, metres, above `clearance`.
+        place: where the smallest clearance was found: number of the edge plus the
+            fraction of it.
+        q: (dof,) that configuration; its clearance is `clearance + tolerance`.
+        configurations: how many were computed.
+        motion: upper bound of any sphere's way along the path, metres.
+    """
+
+    clearance: float
+    tolerance: float
+    place: float
+    q: tuple[float, ...]
+    configurations: int
+    motion: float
+
+    def text(self) -> str:
+        """Return the answer in one line."""
+        return (
+            f"at least {1000 * self.clearance:.2f} mm everywhere, within "
+            f"{1000 * self.tolerance:.2f} mm of the smallest, near waypoint {self.place:.3f} "
+            f"({self.configurations} configurations)"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return dict(self.__dict__)
+
+
+@dataclass(frozen=True)
+class SafeMotion:
+    """Answer of `max_safe_motion`.
+
+    Attributes:
+        fraction: the motion is valid from 0 up to this fraction of dq; 0 if q itself is
+            refused.
+        refused_at: a fraction, just after, at which it is refused; None if all of it is
+            valid.
+        tolerance: metres of motion. From `fraction` to `refused_at` nothing moves more
+            than this, nor from any point before `fraction` to a configuration that was
+            found valid or is proven so by its neighbours' clearances.
+        distance: upper bound of any sphere's way up to `fraction`, metres.
+        reason: why it is refused at `refused_at`; None if it is not.
+        configurations: how many were checked.
+    """
+
+    fraction: float
+    refused_at: float | None
+    tolerance: float
+    distance: float
+    reason: StateReport | None
+    configurations: int
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of the motion is safe."""
+        return self.refused_at is None
+
+    def text(self) -> str:
+        """Return the answer in one line."""
+        if self.reason is None:
+            return f"all of it is safe ({self.configurations} configurations)"
+        return (
+            f"safe up to {self.fraction:.4f} of it (up to {1000 * self.distance:.1f} mm of "
+            f"motion, to within {1000 * self.tolerance:.2f} mm): {self.reason.text()}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        reason = None if self.reason is None else self.reason.to_dict()
+        return {**self.__dict__, "reason": reason}
+
+
+def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> PathClearance:
+    """Return a lower bound of the clearance over a whole path, and where it is smallest.
+
+    Branch and bound over intervals of edges. If no sphere can move more than m from the
+    middle of an interval to anywhere in it, the distance there is at least c - m, where
+    c is the middle's clearance: distances are 1-Lipschitz and c is a lower bound. An
+    interval is closed when that exceeds what is found elsewhere less the tolerance, or
+    when m is at most the tolerance; otherwise its halves are asked. So no configuration
+    on the path is nearer to anything than `clearance`.
+
+    Computed clearances are bounds, which drop by up to a voxel between neighbours:
+    intervals are closed early only if they could not come in under the answer even so.
+
+    Args:
+        checker: a `CollisionChecker`.
+        path: (T, dof) waypoints, T >= 1; edges as `check_motion` checks them.
+        tolerance: metres.
+
+    Raises:
+        RobotError: the shape is wrong, a value is not finite, a sliding joint leaves its
+            limits, or the tolerance is too small.
+    """
+    checked_tolerance(tolerance)
+    edges = edges_of(checker, path)
+    clearances = checker.clearance_batch(edges.path)
+    row = int(np.argmin(clearances))
+    best, place, q = float(clearances[row]), float(row), edges.path[row]
+    count = len(edges.path)
+    slack = float(checker.world.field.spacing)
+    edge = np.flatnonzero(edges.motion > 0.0)
+    middle = np.full(len(edge), 0.5)
+    if len(edge) == 0:
+        tolerance = 0.0
+    half = 0.5
+    while len(edge):
+        Q = edges.at(edge, middle)
+        found = checker.clearance_batch(Q)
+        count += len(Q)
+        row = int(np.argmin(found))
+        if found[row] < best:
+            best, place, q = float(found[row]), float(edge[row] + middle[row]), Q[row]
+        reach = half * edges.motion[edge]
+        still = (reach > tolerance) & (found - reach - slack < best - tolerance)
+        half *= 0.5
+        edge = np.repeat(edge[still], 2)
+        middle = (middle[still][:, None] + half * np.array([-1.0, 1.0])).reshape(-1)
+    return PathClearance(
+        clearance=best - tolerance,
+        tolerance=tolerance,
+        place=place,
+        q=tuple(float(v) for v in q),
+        configurations=count,
+        motion=float(edges.motion.sum()),
+    )
+
+
+def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.0005) -> SafeMotion:
+    """Return how far from q along dq the checker's verdict stays "valid".
+
+    Conservative advancement: from a configuration with clearance c (less the margin)
+    and self gap g the motion cannot be refused before something moves by them. Where
+    they are within a voxel of what is required, or `max_risk` is set (of which no such
+    bound exists), it goes on in steps of at most `tolerance` metres of motion and asks
+    each. What is refused first is then bracketed by halving.
+
+    Args:
+        checker: a `CollisionChecker`.
+        q: (dof,) where the motion starts.
+        dq: (dof,) change of the joints over the whole motion; no joint is wrapped.
+        tolerance: metres of motion.
+
+    Raises:
+        RobotError: a shape is wrong, a value is not finite, or the tolerance is too small.
+    """
+    checked_tolerance(tolerance)
+    march = _March(checker, np.asarray(q), np.asarray(dq), tolerance)
+    safe, refused = march.run()
+    reason = None if refused is None else checker.explain(march.at(refused))
+    gap = 0.0 if refused is None else (refused - safe) * march.motion
+    return SafeMotion(
+        fraction=safe,
+        refused_at=refused,
+        tolerance=max(gap, 0.5 * march.step * march.motion if march.stepped else 0.0),
+        distance=safe * march.motion,
+        reason=reason,
+        configurations=march.count,
+    )
+
+
+class _March:
+    """Walks along a motion; all positions are fractions of it."""
+
+    def __init__(self, checker: Any, q: Numbers, dq: Numbers, tolerance: float) -> None:
+        self.checker = checker
+        self.q = np.ascontiguousarray(q, dtype=np.float64)
+        self.dq = np.ascontiguousarray(dq, dtype=np.float64)
+        for array in (self.q, self.dq):  # the checker refuses what has another shape
+            checker.clearance(array)
+        own, gap = motion_bounds(checker.robot.arrays, self.dq[None])
+        self.world_rate, self.pair_rate = float(own[0]), float(gap[0])
+        self.motion = max(self.world_rate, self.pair_rate)
+        self.step = tolerance / self.motion if self.motion > tolerance else 1.0
+        self.count = 0
+        self.stepped = False
+
+    def at(self, fraction: float) -> Float[np.ndarray, "dof"]:
+        return np.asarray(self.q + fraction * self.dq)
+
+    def run(self) -> tuple[float, float | None]:
+        """Return the last fraction known to be valid and the first known to be refused."""
+        self.count += 1
+        if not self.checker.is_valid(self.q):
+            return 0.0, 0.0
+        end = self._limit()
+        safe = 0.0
+        while safe < 1.0:
+            span = self._span(safe)
+            if span > self.step and safe < end:
+                ahead = min(safe + span, end)
+                self.count += 1
+                if self.checker.is_valid(self.at(ahead)):
+                    safe = ahead
+                    continue
+                end = safe  # rounding at a joint's limit: no more leaps
+            self.stepped = True
+            steps = np.minimum(safe + self.step * np.arange(_BATCH + 1), 1.0)
+            valid = self.checker.is_valid_batch(self.q + steps[1:, None] * self.dq)
+            self.count += _BATCH
+            if not valid.all():
+                first = int(np.argmin(valid))
+                return self._bracket(float(steps[first]), float(steps[first + 1]))
+            safe = float(steps[-1])
+        return 1.0, None
+
+    def _limit(self) -> float:
+        """Return up to which fraction all joints keep their limits."""
+        robot = self.checker.robot
+        moves = (self.dq != 0.0) & ~np.asarray(robot.continuous)
+        ends = np.where(self.dq > 0.0, robot.upper, robot.lower)[moves]
+        return float(np.min((ends - self.q[moves]) / self.dq[moves], initial=1.0))
+
+    def _span(self, fraction: float) -> float:
+        """Return how far the clearances at a fraction reach, a voxel in reserve."""
+        if self.checker.config.max_risk is not None:
+            return 0.0
+        Q = self.at(fraction)[None]
+        config, spacing = self.checker.config, float(self.checker.world.field.spacing)
+        self.count += 1
+        room = float(self.checker.clearance_batch(Q)[0]) - config.margin - spacing
+        gap = float(self.checker.self_clearance_batch(Q)[0]) - config.self_margin
+        spans = [
+            free / rate if rate > 0.0 else np.inf
+            for free, rate in ((room, self.world_rate), (gap, self.pair_rate))
+        ]
+        return min(1.0, *spans)
+
+    def _bracket(self, safe: float, refused: float) -> tuple[float, float]:
+        """Halve the step between a valid and a refused fraction to a millionth of it."""
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (safe + refused)
+            if refused - safe <= 1e-3 * self.step or not safe < middle < refused:
+                break
+            self.count += 1
+            if self.checker.is_valid(self.at(middle)):
+                safe = middle
+            else:
+                refused = middle
+        return safe, refused
