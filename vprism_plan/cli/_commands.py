@@ -86,6 +86,11 @@ class Plan:
     margin: float = 0.005
     """Clearance to keep from everything (m); the true surface can lie a few millimetres
     outside the map's."""
+    max_risk: Annotated[float | None, arg(metavar="P")] = None
+    """Bound on the probability that the path touches anything (0 to 1): objects are then
+    judged by draws from the map's posterior, not by its level set."""
+    allow: Annotated[tuple[str, ...], arg(metavar="LINK:ID ...")] = ()
+    """Contacts to allow: a link or group of the robot and the id of an object, as hand:3."""
     occluded: Literal["occupied", "posterior", "free"] = "occupied"
     """What space behind visible surfaces counts as."""
     unobserved: Literal["free", "occupied"] = "free"

@@ -20,7 +20,7 @@ from vprism_plan.cli._placing import (
 from vprism_plan.errors import PlanningError
 
 if TYPE_CHECKING:
-    from vprism_plan.collision import CollisionChecker
+    from vprism_plan.collision import CheckerConfig, CollisionChecker
     from vprism_plan.mapping import VPrismMap
     from vprism_plan.robots import Robot
     from vprism_plan.world import World
@@ -36,11 +36,12 @@ def run_plan(command: Plan, console: Console) -> int:
 
     robot = Robot.from_urdf(command.robot)  # before the long work: the file may be wrong
     _check_lengths(command, robot)
+    checks = _checks(command, robot)
     m = _map_from(command.input, command.frame, command.seed, console)
     world = _bake(m, command, console)
     try:
         with console.stage("place"):
-            situation = _place(command, robot, world)
+            situation = _place(command, robot, world, checks)
     except NoPlaceError as error:
         console.finish(
             {
@@ -143,6 +144,27 @@ def _checker(world: "World", robot: "Robot", margin: float) -> "CollisionChecker
     return CollisionChecker(world, robot, CheckerConfig(margin=margin))
 
 
+def _checks(command: Plan, robot: "Robot") -> "CheckerConfig":
+    """Return what the checker is asked for; refuses bad values before the long work.
+
+    Raises:
+        PlanningError, RobotError, ConfigError: what is wrong.
+    """
+    from vprism_plan.collision import CheckerConfig
+
+    allowed: dict[str, set[int]] = {}
+    for text in command.allow:
+        name, colon, number = text.rpartition(":")
+        if not (colon and name and number.isdigit()):
+            raise PlanningError(
+                f"--allow {text!r} is not LINK:ID; give a link or group and an object's id, "
+                "for example hand:3"
+            )
+        robot.links_of(name)
+        allowed.setdefault(name, set()).add(int(number))
+    return CheckerConfig(margin=command.margin, max_risk=command.max_risk, allowed_contacts=allowed)
+
+
 def _check_lengths(command: Plan, robot: "Robot") -> None:
     """Refuse malformed configurations before the long work.
 
@@ -189,12 +211,14 @@ def _standing(
     raise PlanningError("no free place for the base beside the objects; give --base-xyz")
 
 
-def _place(command: Plan, robot: "Robot", world: "World") -> Situation:
+def _place(command: Plan, robot: "Robot", world: "World", checks: "CheckerConfig") -> Situation:
     """Return robot, checker, start and goal; what is open is chosen so that it is valid.
 
     Raises:
         NoPlaceError: no valid start and goal on both sides of the objects.
     """
+    from vprism_plan.collision import CollisionChecker
+
     around = Surroundings.of(world.map)
     if command.base_xyz is not None:
         poses = [base_pose(np.array(command.base_xyz), around, command.base_yaw)]
@@ -207,7 +231,7 @@ def _place(command: Plan, robot: "Robot", world: "World") -> Situation:
         placed = robot.with_base_pose(pose)
         if command.base_xyz is None and not stands_free(placed, world):
             continue
-        checker = _checker(world, placed, command.margin)
+        checker = CollisionChecker(world, placed, checks)
         rng = np.random.default_rng([command.seed, number])
         ends = choose_ends(
             checker,

@@ -2,7 +2,7 @@
 """What becomes of a planning query: pictures, trajectory, report, a few lines of text."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from vprism_plan.cli._staging import PLAN_FILES, staged
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
     from vprism_plan.planning import PlanResult
+    from vprism_plan.planning.result import PlanReport
     from vprism_plan.robots import Robot
 
 _PROFILE = 64  # clearances along the path in the report
@@ -80,7 +81,7 @@ def _payload(
         "goal": situation.goal,
         "chosen_automatically": list(situation.chosen),
         "path": result.path,
-        "plan": {"status": result.status, "message": result.message, **asdict(result.report)},
+        "plan": {"status": result.status, "message": result.message, **_numbers(result.report)},
         "explanation": None if explanation is None else explanation.text(),
         "map": describe_map(world.map),
         "world": {
@@ -90,12 +91,21 @@ def _payload(
             "resolution": world.config.resolution,
             "nodes": list(world.field.distance.shape),
             "margin": checker.config.margin,
+            "max_risk": checker.config.max_risk,
         },
         "meshes": {str(i): {"triangles": len(mesh.faces)} for i, mesh in meshes.items()},
         "timings": console.timings,
         "compile_seconds": console.compile_seconds,
         "compiled_kernels": console.compiled,
     }
+
+
+def _numbers(report: "PlanReport") -> dict[str, Any]:
+    """Return the report's fields, JSON-ready."""
+    values = {field.name: getattr(report, field.name) for field in fields(report)}
+    values["risk"] = None if report.risk is None else report.risk.to_dict()
+    values["allowed_contacts"] = [contact.to_dict() for contact in report.allowed_contacts]
+    return values
 
 
 def _write_trajectory(situation: Situation, result: "PlanResult", aside: Path) -> dict[str, Any]:
@@ -222,6 +232,16 @@ def _lines(
                 f"{1000 * payload['truth']['minimum_distance']:.1f} mm "
                 f"({payload['truth']['link']}; sampled every "
                 f"{1000 * payload['truth']['largest_motion_between_samples']:.1f} mm or less)"
+            )
+        if report.risk is not None:
+            lines.append(
+                f"risk: {report.risk.text()}; bound {payload['world']['max_risk']:g}, judged by "
+                f"draws the search has not seen, tightened {report.risk_levels} times"
+            )
+        if report.allowed_contacts:
+            lines.append(
+                "ends touching, as allowed: "
+                + ", ".join(f"{c.link} on {c.body}" for c in report.allowed_contacts)
             )
         share = sum(report.shares.get(kind, 0.0) for kind in ("unobserved", "outside"))
         lines.append(
