@@ -194,6 +194,51 @@ def touch(
 
 
 @njit(cache=True, nogil=True)
+def touch_one(
+    C, radii, rules, distance_row, rows, lowest, highest, first, spacing, scale, reach, touched
+):
+    """`touch` for one sample C (3, m) without slack: how many draws touch, or -1 if a voxel
+    is unbaked. touched (S,) must be zero. Fewer arrays make a quicker call."""
+    _, ex, ey, ez = distance_row.shape
+    n_draws = rows.shape[1]
+    some = False
+    for j in range(C.shape[1]):
+        rule = rules[j]
+        if rule < 0:
+            continue
+        gx = C[0, j] / spacing - first[0]
+        gy = C[1, j] / spacing - first[1]
+        gz = C[2, j] / spacing - first[2]
+        if not (-0.5 < gx < ex - 0.5 and -0.5 < gy < ey - 0.5 and -0.5 < gz < ez - 0.5):
+            continue
+        x = int(gx + 0.5)
+        y = int(gy + 0.5)
+        z = int(gz + 0.5)
+        row = distance_row[rule, x, y, z]
+        if row < 0:
+            if row == UNBAKED:
+                return -1
+            continue
+        need = radii[j] / spacing
+        need += np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+        if need >= reach or highest[row] <= np.uint8(need * scale):
+            touched[:] = 1
+            return n_draws
+        limit = np.uint8(need * scale)
+        if lowest[row] > limit:
+            continue
+        some = True
+        values = rows[row]
+        for s in range(n_draws):
+            touched[s] |= np.uint8(values[s] <= limit)
+    total = 0
+    if some:
+        for s in range(n_draws):
+            total += touched[s]
+    return total
+
+
+@njit(cache=True, nogil=True)
 def touch_each(
     centers, radii, distance_row, rows, first, spacing, scale, reach, out, wanted
 ):  # fmt: skip

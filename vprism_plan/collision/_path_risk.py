@@ -4,7 +4,7 @@
 import copy
 import dataclasses
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -82,6 +82,7 @@ class PathRisk:
             config.n_worlds, config.risk_seed, reach=largest + room * resolution
         )
         self.spacing = min(resolution, 0.5 * world.map.kernel_length)
+        self._voxel, self._steps = self.worlds.first, self.worlds.scale
         self._table_of = np.array([self.worlds.rule(ids) for ids in rules], dtype=np.int64)
         per_link = np.where(arrays.link_fixed, -1, self._table_of[link_rules])
         self._sphere_rules = per_link[arrays.sphere_link].astype(np.int64)
@@ -159,7 +160,22 @@ class PathRisk:
 
     def hits_at(self, q: Float[np.ndarray, "dof"]) -> int:
         """Return how many worlds collide at a configuration, certain obstacles aside."""
-        return int(self._touch(*self._place(q[None]))[1][0])
+        return self._touch_at(q)[1]
+
+    def _touch_at(self, q: Float[np.ndarray, "dof"]) -> tuple[Float[np.ndarray, "3 s"], int]:
+        """Sphere centres at a configuration, and how many worlds they touch."""
+        worlds = self.worlds
+        centers = np.empty((3, len(self._radii)))
+        checking.place_spheres(q, self._rf, self._ri, centers)
+        tables, (scale, reach) = worlds.tables, self._steps
+        hits = risk.touch_one(
+            centers, self._radii, self._sphere_rules, tables.distance_row, tables.rows,
+            tables.lowest, tables.highest, self._voxel, worlds.resolution, scale, reach,
+            np.zeros(worlds.n_worlds, np.uint8),
+        )  # fmt: skip
+        if hits < 0:  # the first to ask here: bake, then count
+            hits = int(self._touch(centers[None], np.zeros((1, len(self._radii))))[1][0])
+        return centers, hits
 
     def hits_each(self, Q: Float[np.ndarray, "n dof"]) -> Int[np.ndarray, " n"]:
         """Return `hits_at` of each row."""
@@ -194,23 +210,46 @@ class PathRisk:
             worlds.bake_marked(wanted)
 
     # --- estimates ---------------------------------------------------------------------
+    def estimate_at(self, q: Float[np.ndarray, "dof"]) -> RiskEstimate:
+        """Return the probability of collision at a configuration."""
+        centers, hits = self._touch_at(q)
+        edge = -1 if checking.is_valid(q, self._rf, self._ri, *self.packed) else 0
+        per_waypoint = np.array([1.0 if edge >= 0 else hits / self.worlds.n_worlds])
+
+        def trace() -> tuple[FirstContact, ...]:
+            path = q[None].copy()
+            return self._first_contacts(path, self.sweep(path), edge, 0.0)
+
+        return self._result(hits, edge, per_waypoint, centers[None], trace)
+
     def estimate(self, path: Float[np.ndarray, "t dof"]) -> RiskEstimate:
         """Return the joint probability of collision along a path."""
         sweep = self.sweep(path)
         clear = np.empty(len(path), np.bool_)
         checking.is_valid_batch(path, self._rf, self._ri, *self.packed, clear)
         stats = np.zeros(4)
-        if len(path) == 1:
-            edge = -1 if clear[0] else 0
-        else:
-            edge = checking.check_path(
-                path, self._rf, self._ri, *self.packed, self.config.min_motion, stats
-            )
-        n = self.worlds.n_worlds
-        hits = int(sweep.touched.sum())
-        per_waypoint = sweep.counts[sweep.waypoints] / n
+        edge = checking.check_path(
+            path, self._rf, self._ri, *self.packed, self.config.min_motion, stats
+        )
+        per_waypoint = sweep.counts[sweep.waypoints] / self.worlds.n_worlds
         per_waypoint[~clear] = 1.0
-        shares = self._shares(sweep)
+        kept, fraction = path.copy(), float(stats[0])
+
+        def trace() -> tuple[FirstContact, ...]:
+            return self._first_contacts(kept, sweep, edge, fraction)
+
+        hits = int(sweep.touched.sum())
+        return self._result(hits, edge, per_waypoint, sweep.centers, trace)
+
+    def _result(
+        self,
+        hits: int,
+        edge: int,
+        per_waypoint: Float[np.ndarray, " t"],
+        centers: Float[np.ndarray, "n 3 s"],
+        trace: Callable[[], tuple[FirstContact, ...]],
+    ) -> RiskEstimate:
+        n = self.worlds.n_worlds
         return RiskEstimate(
             probability=1.0 if edge >= 0 else hits / n,
             lower=1.0 if edge >= 0 else float(self._lower[hits]),
@@ -219,12 +258,11 @@ class PathRisk:
             n_worlds=n,
             seed=self.worlds.seed,
             per_waypoint=per_waypoint,
-            first_contact=self._first_contacts(path, sweep, edge, float(stats[0])),
             certain=edge >= 0,
-            unsupported_share=float(sum(shares.values())),
-            shares=shares,
             spacing=self.spacing,
-            configurations=len(sweep.counts),
+            configurations=len(centers),
+            trace=trace,
+            volume=lambda: self._shares(centers),
         )
 
     def contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
@@ -254,10 +292,10 @@ class PathRisk:
             )
         return tuple(found)
 
-    def _shares(self, sweep: Sweep) -> dict[str, float]:
+    def _shares(self, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:
         if self._codes is None:
             self._codes = SpaceCodes(self._world)
-        return self._codes.shares(sweep.centers, self._radii, self._sphere_rules)
+        return self._codes.shares(centers, self._radii, self._sphere_rules)
 
     def _first_contacts(
         self, path: Float[np.ndarray, "t dof"], sweep: Sweep, edge: int, fraction: float

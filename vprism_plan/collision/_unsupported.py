@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from vprism_plan._kernels import risk as kernels
 
-_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
+_ONE = np.zeros(1, np.int64)
 _MAX_SAMPLES = 64
 _SLAB = 8  # planes of nodes classified at once
 
@@ -53,11 +53,16 @@ class SpaceCodes:
         weighted by volume, averaged over at most 64 samples spread along the path.
         Balls with rule -1 (not checked) do not count.
         """
-        n = min(len(centers), _MAX_SAMPLES)
-        chosen = np.arange(n) * (len(centers) - 1) // max(n - 1, 1)
+        n = len(centers)
+        chosen = _ONE if n == 1 else np.arange(m := min(n, _MAX_SAMPLES)) * (n - 1) // (m - 1)
         totals = np.zeros(4)
         kernels.volume_codes(
             centers, chosen, radii, rules, self._codes, self._origin, self._spacing, totals
         )
-        whole = max(float(totals.sum()), 1e-300)
-        return {name: float(totals[code]) / whole for code, name in _NAMES.items()}
+        seen, occluded, unobserved, outside = totals.tolist()
+        whole = max(seen + occluded + unobserved + outside, 1e-300)
+        return {
+            "occluded": occluded / whole,
+            "unobserved": unobserved / whole,
+            "outside": outside / whole,
+        }

@@ -270,7 +270,9 @@ class CollisionChecker:
         if self._slides:
             require_prismatic_limits(self.robot, rows)
         risk = self._risk()
-        return (risk.held_out() if held_out else risk).estimate(rows)
+        if held_out:
+            risk = risk.held_out()
+        return risk.estimate_at(rows[0]) if len(rows) == 1 else risk.estimate(rows)
 
     def _ruled_world(self) -> RuledWorld:
         if not isinstance(self.world, RuledWorld):

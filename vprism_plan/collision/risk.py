@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The probability that a path touches anything, with its interval and its causes."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -49,15 +51,13 @@ class RiskEstimate:
         n_worlds: worlds drawn.
         seed: of the draws.
         per_waypoint: (T,) the same probability at each waypoint alone.
-        first_contact: causes, the most frequent first; empty if no world collides.
         certain: whether the path hits what is an obstacle in every world: support surface,
             background, unseen space by policy, known geometry.
-        unsupported_share: share of the swept volume in space the map cannot judge: hidden
-            without support, or never observed.
-        shares: the same by kind: "occluded", "unobserved", "outside" (the grid).
         spacing: no sphere centre moves more than this between two samples, metres; what
             lies between samples is covered by growing the spheres.
         configurations: samples taken.
+        trace, volume: find `first_contact` and `shares`, which cost more than the rest and
+            are often not asked for.
     """
 
     probability: float
@@ -67,12 +67,33 @@ class RiskEstimate:
     n_worlds: int
     seed: int
     per_waypoint: Float[np.ndarray, " t"]
-    first_contact: tuple[FirstContact, ...]
     certain: bool
-    unsupported_share: float
-    shares: dict[str, float]
     spacing: float
     configurations: int
+    trace: Callable[[], tuple[FirstContact, ...]] = field(repr=False, compare=False)
+    volume: Callable[[], dict[str, float]] = field(repr=False, compare=False)
+
+    @cached_property
+    def first_contact(self) -> tuple[FirstContact, ...]:
+        """What the worlds collide with first: causes, the most frequent first; empty if no
+        world collides."""
+        return self.trace()
+
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """Share of the swept volume that the map cannot judge, by kind: "occluded" (hidden,
+        without support), "unobserved", "outside" (the grid)."""
+        return self.volume()
+
+    @property
+    def unsupported_share(self) -> float:
+        """Share of the swept volume in space that the map cannot judge."""
+        return sum(self.shares.values())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Find what is left to find before the estimate leaves the process."""
+        found = {"first_contact": self.first_contact, "shares": self.shares}
+        return {**self.__dict__, **found, "trace": tuple, "volume": dict}
 
     def text(self) -> str:
         """Return the estimate in one line."""
