@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""How unsure the map is of the space that a robot passes through, in nats."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from vprism_plan.collision._explain import unit_ball_points
+from vprism_plan.collision._travel import edges_of, place_points
+from vprism_plan.collision.protocols import Numbers
+from vprism_plan.errors import RobotError
+from vprism_plan.robots._frames import frame_poses
+
+_POINTS = 48  # per sphere and waypoint
+_MAX_CELLS = 200_000_000
+_CHUNK = 1 << 20  # voxel candidates in memory at once
+
+
+@dataclass(frozen=True)
+class PathEntropy:
+    """Answer of `path_entropy`. Only links that joints move count.
+
+    The map's entropy means something where it has support (kernel mass at least
+    `WorldConfig.min_support`); elsewhere it repeats the prior. Means, maxima and
+    totals are over supported volume only; the rest is reported as a share.
+
+    Attributes:
+        waypoint_mean: (T,) entropy averaged over the spheres' supported volume, nats;
+            nan where no part of the robot is in supported space.
+        waypoint_max: (T,) largest average of any one sphere, nats; nan likewise.
+        waypoint_unsupported: (T,) share of the spheres' volume without support.
+        swept_total: integral of the entropy over the supported part of the volume that
+            the spheres sweep along the path, m^3 nats; every voxel counts once.
+        swept_mean: its average there, nats; nan if nothing is supported.
+        swept_volume: all of the swept volume, m^3.
+        unsupported_share: share of the swept volume without support.
+        resolution: edge of the voxels, metres. A voxel is swept if its centre is in some
+            sphere at some sampled configuration.
+        spacing: largest motion between two samples, metres.
+        configurations: samples on the path.
+        voxels: voxels swept.
+        map_points: points at which the map was evaluated: what the answer cost.
+    """
+
+    waypoint_mean: tuple[float, ...]
+    waypoint_max: tuple[float, ...]
+    waypoint_unsupported: tuple[float, ...]
+    swept_total: float
+    swept_mean: float
+    swept_volume: float
+    unsupported_share: float
+    resolution: float
+    spacing: float
+    configurations: int
+    voxels: int
+    map_points: int
+
+    def text(self) -> str:
+        """Return the answer in one line."""
+        mean = "no support" if np.isnan(self.swept_mean) else f"mean entropy {self.swept_mean:.3f}"
+        return (
+            f"{mean} nats over the supported {100 * (1 - self.unsupported_share):.0f}% of "
+            f"{1000 * self.swept_volume:.1f} l swept (total {1000 * self.swept_total:.3f} l nats, "
+            f"voxels of {1000 * self.resolution:g} mm)"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values; null where nothing is supported."""
+        plain: dict[str, Any] = {}
+        for name, value in self.__dict__.items():
+            if isinstance(value, tuple):
+                plain[name] = [None if np.isnan(v) else v for v in value]
+            else:
+                plain[name] = None if isinstance(value, float) and np.isnan(value) else value
+        return plain
+
+
+def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> PathEntropy:
+    """Return the map's entropy along a path and over the volume it sweeps.
+
+    Per waypoint 48 points in every sphere are asked; in the swept volume every voxel
+    whose centre some sphere covers, once. Edges are sampled so that nothing moves more
+    than half a voxel between samples: between two balls of radius r that leaves out a
+    rim at most resolution^2 / (32 r) deep. O(configurations x spheres x voxels per
+    sphere) additions and one evaluation of the map per voxel near its support.
+
+    Args:
+        checker: a `CollisionChecker` over a `World`.
+        q_or_path: (T, dof) waypoints, or (dof,) one configuration.
+        resolution: edge of a voxel, metres.
+
+    Raises:
+        RobotError: the shape is wrong, a value is not finite, a sliding joint leaves its
+            limits, or the resolution is too fine for the path.
+    """
+    if not (np.isfinite(resolution) and resolution > 0.0):
+        raise RobotError(f"resolution is {resolution!r}; it must be positive and finite (metres)")
+    array = np.asarray(q_or_path, dtype=np.float64)
+    edges = edges_of(checker, array[None] if array.ndim == 1 else array)
+    Q, _ = edges.samples(0.25 * resolution)
+    mean, most, unsupported, asked = _at_waypoints(checker, edges.path)
+    voxels = swept_voxels(checker, Q, resolution)
+    entropy, supported, more = _entropy(checker, resolution * voxels)
+    cell = resolution**3
+    return PathEntropy(
+        waypoint_mean=mean,
+        waypoint_max=most,
+        waypoint_unsupported=unsupported,
+        swept_total=cell * float(entropy.sum()),
+        swept_mean=float(entropy.mean()) if len(entropy) else np.nan,
+        swept_volume=cell * len(voxels),
+        unsupported_share=1.0 - float(supported.mean()) if len(voxels) else 0.0,
+        resolution=resolution,
+        spacing=0.5 * resolution,
+        configurations=len(Q),
+        voxels=len(voxels),
+        map_points=asked + more,
+    )
+
+
+def _moving(checker: Any) -> Int[np.ndarray, " s"]:
+    arrays = checker.robot.arrays
+    return np.flatnonzero(~np.asarray(arrays.link_fixed)[arrays.sphere_link])
+
+
+def _centers(
+    checker: Any, Q: Float[np.ndarray, "n dof"], spheres: Int[np.ndarray, " s"]
+) -> Float[np.ndarray, "n s 3"]:
+    arrays = checker.robot.arrays
+    R, t = frame_poses(arrays, Q)
+    return place_points(R, t, arrays.sphere_frame[spheres], arrays.sphere_center[spheres])
+
+
+def _entropy(
+    checker: Any, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " k"], Bool[np.ndarray, " n"], int]:
+    """Entropy, nats, of the points with support; which those are; how many the map was asked."""
+    map_, least = checker.world.map, checker.world.config.min_support
+    lower, upper = map_.support_bounds()
+    near = ((points > lower) & (points < upper)).all(axis=1)
+    supported = near.copy()
+    supported[near] = np.asarray(map_.support(points[near])) >= least
+    if least <= 0.0:
+        supported[:] = True
+    entropy = np.asarray(map_.entropy(points[supported]))
+    return entropy, supported, int(near.sum() + supported.sum())
+
+
+def _at_waypoints(
+    checker: Any, path: Float[np.ndarray, "t dof"]
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int]:
+    """Mean, largest sphere average and unsupported share per waypoint; points asked."""
+    spheres = _moving(checker)
+    radii = checker.robot.arrays.sphere_radius[spheres]
+    ball = unit_ball_points(_POINTS)
+    mean, most, unsupported, asked = [], [], [], 0
+    for q in path:
+        centers = _centers(checker, q[None], spheres)[0]
+        points = (centers[:, None] + radii[:, None, None] * ball).reshape(-1, 3)
+        entropy, supported, count = _entropy(checker, points)
+        asked += count
+        values = np.zeros(len(points))
+        values[supported] = entropy
+        known = supported.reshape(-1, _POINTS).sum(axis=1)
+        sums = values.reshape(-1, _POINTS).sum(axis=1)
+        weight = radii**3
+        total = float(weight @ known)
+        mean.append(float(weight @ sums) / total if total > 0 else np.nan)
+        most.append(float((sums[known > 0] / known[known > 0]).max()) if known.any() else np.nan)
+        whole = _POINTS * float(weight.sum())
+        unsupported.append(1.0 - total / whole if whole > 0 else 0.0)
+    return tuple(mean), tuple(most), tuple(unsupported), asked
+
+
+def swept_voxels(
+    checker: Any, Q: Float[np.ndarray, "n dof"], resolution: float
+) -> Int[np.ndarray, "v 3"]:
+    """Voxels, each once, whose centre lies in a sphere of a moving link at some row of Q.
+
+    Voxel (i, j, k) has its centre at resolution * (i, j, k), world, metres.
+
+    Raises:
+        RobotError: the resolution is too fine for what the robot sweeps.
+    """
+    spheres = _moving(checker)
+    if len(spheres) == 0:
+        return np.empty((0, 3), dtype=np.int64)
+    centers = _centers(checker, Q, spheres)
+    radii = checker.robot.arrays.sphere_radius[spheres]
+    grown = radii[:, None] + 2.0 * resolution
+    low = np.floor((centers - grown).min(axis=(0, 1)) / resolution).astype(np.int64)
+    high = np.ceil((centers + grown).max(axis=(0, 1)) / resolution).astype(np.int64)
+    shape = tuple(int(n) for n in high - low + 1)
+    if float(np.prod(high - low + 1.0)) > _MAX_CELLS:
+        raise RobotError(
+            f"voxels of {resolution:g} m over what the robot sweeps would be "
+            f"{' x '.join(map(str, shape))} (at most {_MAX_CELLS:,}); give a coarser resolution"
+        )
+    swept = np.zeros(shape, dtype=bool)
+    for s, radius in enumerate(radii):
+        _stamp(swept, low, _thinned(centers[:, s], 0.5 * resolution), float(radius), resolution)
+    return np.argwhere(swept) + low
+
+
+def _thinned(centers: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "m 3"]:
+    """Leave out centres as long as the way between those kept is at most the spacing."""
+    way = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(way)])
+    kept = [0]
+    while kept[-1] < len(centers) - 1:
+        reach = int(np.searchsorted(along, along[kept[-1]] + spacing, side="right")) - 1
+        kept.append(max(reach, kept[-1] + 1))
+    return centers[kept]
+
+
+def _stamp(
+    swept: Bool[np.ndarray, "x y z"],
+    low: Int[np.ndarray, " 3"],
+    centers: Float[np.ndarray, "m 3"],
+    radius: float,
+    resolution: float,
+) -> None:
+    """Mark the voxels whose centres lie in any of some balls of one radius."""
+    span = np.arange(2 * (int(radius / resolution) + 1) + 1)
+    first = np.ceil((centers - radius) / resolution - 1.0).astype(np.int64)
+    step = max(1, _CHUNK // len(span) ** 3)
+    for begin in range(0, len(centers), step):
+        corner = first[begin : begin + step]
+        away = resolution * (corner[:, :, None] + span) - centers[begin : begin + step, :, None]
+        x, y, z = np.moveaxis(away**2, 1, 0)
+        inside = x[:, :, None, None] + y[:, None, :, None] + z[:, None, None, :] <= radius**2
+        for (i, j, k), ball in zip((corner - low).tolist(), inside, strict=True):
+            n = len(span)
+            swept[i : i + n, j : j + n, k : k + n] |= ball
