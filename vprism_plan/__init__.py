@@ -13,7 +13,7 @@ from vprism_plan import errors
 from vprism_plan.errors import VPrismError
 
 if TYPE_CHECKING:
-    from vprism_plan.collision import CheckerConfig, CollisionChecker
+    from vprism_plan.collision import CheckerConfig, CollisionChecker, MeshChecker
     from vprism_plan.mapping import MapConfig, VPrismMap, fit_map, load_map
     from vprism_plan.perception import (
         Observation,
@@ -31,6 +31,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "CheckerConfig": "collision",
     "CollisionChecker": "collision",
+    "MeshChecker": "collision",
     "MapConfig": "mapping",
     "VPrismMap": "mapping",
     "fit_map": "mapping",
@@ -52,6 +53,7 @@ __all__ = [
     "CheckerConfig",
     "CollisionChecker",
     "MapConfig",
+    "MeshChecker",
     "Observation",
     "PosteriorWorlds",
     "Robot",

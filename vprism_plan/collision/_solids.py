@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The robot as FCL shapes: primitives, meshes, or spheres where a link has neither."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.collision._fcl import Shape
+from vprism_plan.collision._packing import reach_table
+from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan.robots import Robot
+from vprism_plan.world.rasterize import winding_number
+
+LinkShapes = Literal["geometry", "spheres"]
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """One shape of a link.
+
+    Attributes:
+        link: index into `robot.link_names`.
+        sphere: index of the collision sphere it is, or -1.
+        shape: what FCL is asked about.
+        T_link: (4, 4) pose in the link's frame.
+        center: (3,) centre of a ball that holds it, link frame, metres.
+        radius: of that ball, metres.
+        witness: (3,) a point of the shape, link frame: the shape is connected, so where
+            no surface cuts it this point tells which side all of it is on.
+        vertices: (v, 3) of a mesh, link frame; None for primitives.
+        mesh: closed `trimesh.Trimesh` whose inside counts, link frame; else None.
+    """
+
+    link: int
+    sphere: int
+    shape: Shape
+    T_link: Float[np.ndarray, "4 4"]
+    center: Float[np.ndarray, "3"]
+    radius: float
+    witness: Float[np.ndarray, "3"]
+    vertices: np.ndarray | None = None
+    mesh: Any = None
+
+    def holds(self, point: Float[np.ndarray, "3"]) -> bool:
+        """Whether a point (link frame) is inside a closed mesh."""
+        if self.mesh is None:
+            return False
+        triangles = np.asarray(self.mesh.vertices, dtype=np.float64)[self.mesh.faces]
+        return abs(winding_number(point, triangles)) > 0.5
+
+
+def robot_solids(
+    robot: Robot, links: LinkShapes, link_meshes: Mapping[str, Any] | None
+) -> list[Solid]:
+    """Return the shapes of every link that carries collision spheres.
+
+    Args:
+        robot: the robot.
+        links: "geometry" (a mesh of `link_meshes`, else the URDF's primitives, else the
+            spheres) or "spheres".
+        link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres.
+
+    Raises:
+        ConfigError: `links` is neither.
+        RobotError: a mesh is for an unknown link, or cannot be used.
+    """
+    if links not in ("geometry", "spheres"):
+        raise ConfigError(f"links is {links!r}; it must be 'geometry' or 'spheres'")
+    meshes = dict(link_meshes or {})
+    unknown = sorted(set(meshes) - set(robot.link_names))
+    if unknown:
+        raise RobotError(
+            f"link_meshes names {unknown}, which carry no collision spheres; "
+            f"links: {list(robot.link_names)}"
+        )
+    if meshes and links == "spheres":
+        raise ConfigError("link_meshes are given but links is 'spheres'; use links='geometry'")
+    in_link = _spheres_in_links(robot)
+    partial = set(robot.links_with_meshes)
+    solids: list[Solid] = []
+    for index, name in enumerate(robot.link_names):
+        if links == "geometry" and name in meshes:
+            solids += _mesh_solids(index, name, meshes[name])
+        elif links == "geometry" and name in robot.geometry and name not in partial:
+            solids += [
+                _primitive(index, -1, s.kind, s.size, s.T_link) for s in robot.geometry[name]
+            ]
+        else:
+            for sphere in np.flatnonzero(robot.sphere_links == index):
+                pose = np.eye(4)
+                pose[:3, 3] = in_link[sphere]
+                radius = (float(robot.sphere_radii[sphere]),)
+                solids.append(_primitive(index, int(sphere), "sphere", radius, pose))
+    return solids
+
+
+def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
+    """Sphere centres in their links' frames: they do not depend on the configuration."""
+    import torch
+
+    q = robot.neutral
+    world = robot.sphere_centers(torch.from_numpy(q)).numpy()
+    poses = robot.link_poses(q)
+    of_link = [poses[robot.link_names[int(link)]] for link in robot.sphere_links]
+    return np.array(
+        [T[:3, :3].T @ (x - T[:3, 3]) for T, x in zip(of_link, world, strict=True)]
+    ).reshape(-1, 3)
+
+
+def _primitive(
+    link: int, sphere: int, kind: str, size: Sequence[float], T_link: Float[np.ndarray, "4 4"]
+) -> Solid:
+    size = tuple(float(v) for v in size)
+    radius = {
+        "sphere": lambda: size[0],
+        "box": lambda: 0.5 * float(np.linalg.norm(size)),
+        "cylinder": lambda: float(np.hypot(size[0], 0.5 * size[1])),
+    }[kind]()
+    center = np.array(T_link[:3, 3])
+    return Solid(link, sphere, Shape(kind, size), np.array(T_link), center, radius, center)
+
+
+def _mesh_solids(link: int, name: str, mesh: Any) -> list[Solid]:
+    """One solid per connected piece, so that a single point tells where a piece is."""
+    vertices = np.asarray(getattr(mesh, "vertices", np.empty((0, 3))), dtype=np.float64)
+    faces = np.asarray(getattr(mesh, "faces", np.empty((0, 3))))
+    if len(vertices) == 0 or len(faces) == 0 or not np.isfinite(vertices).all():
+        raise RobotError(
+            f"the mesh of link '{name}' is a {type(mesh).__name__} with {len(faces)} triangles; "
+            "it must be a trimesh.Trimesh with finite vertices and at least one triangle"
+        )
+    solids = []
+    for piece in mesh.split(only_watertight=False):
+        points = np.asarray(piece.vertices, dtype=np.float64)
+        center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        radius = float(np.linalg.norm(points - center, axis=1).max())
+        closed = piece if piece.is_watertight else None
+        shape = Shape("mesh", mesh=piece)
+        solids.append(Solid(link, -1, shape, np.eye(4), center, radius, points[0], points, closed))
+    return solids
+
+
+class PlacedSolids:
+    """All solids of a robot, and where a configuration puts them."""
+
+    def __init__(self, robot: Robot, solids: list[Solid]) -> None:
+        self.robot = robot
+        self.solids = solids
+        self.links = np.array([solid.link for solid in solids], dtype=np.int64)
+        self.radii = np.array([solid.radius for solid in solids])
+        self.moving = ~np.asarray(robot.fixed_links)[self.links]
+        self._names = [robot.link_names[i] for i in np.unique(self.links)]
+        self._row = np.searchsorted(np.unique(self.links), self.links)
+        self._local = np.array([solid.T_link for solid in solids]).reshape(-1, 4, 4)
+        self._centers = np.array([solid.center for solid in solids]).reshape(-1, 3)
+        self._witness = np.array([solid.witness for solid in solids]).reshape(-1, 3)
+        self._levers = self._lever_table()
+        # Half edges of boxes, half lengths and radii of cylinders, radii of spheres: a
+        # primitive reaches as far in a direction as these say together.
+        self._halves = np.zeros((len(solids), 3))
+        self._rims, self._balls = np.zeros(len(solids)), np.zeros(len(solids))
+        self._meshes = np.flatnonzero([solid.vertices is not None for solid in solids])
+        for i, solid in enumerate(solids):
+            size = solid.shape.size
+            if solid.shape.kind == "box":
+                self._halves[i] = 0.5 * np.array(size)
+            elif solid.shape.kind == "cylinder":
+                self._rims[i], self._halves[i, 2] = size[0], 0.5 * size[1]
+            elif solid.shape.kind == "sphere":
+                self._balls[i] = size[0]
+        # Where the last call of `place` put everything.
+        self.R = self.t = self.centers = self.witnesses = np.empty(0)
+        self._link_poses = np.empty(0)
+
+    def place(self, q: Float[np.ndarray, "dof"]) -> None:
+        """Compute all poses; shapes are moved one by one, when they are asked about."""
+        poses = self.robot.link_poses(q)
+        self._link_poses = np.array([poses[name] for name in self._names])
+        T = self._link_poses[self._row]
+        world = T @ self._local
+        self.R, self.t = world[:, :3, :3], world[:, :3, 3]
+        self.centers = np.einsum("nij,nj->ni", T[:, :3, :3], self._centers) + T[:, :3, 3]
+        self.witnesses = np.einsum("nij,nj->ni", T[:, :3, :3], self._witness) + T[:, :3, 3]
+
+    def shape(self, i: int) -> Shape:
+        """Return a solid's shape, moved to where `place` put it."""
+        shape = self.solids[i].shape
+        shape.place(self.R[i], self.t[i])
+        return shape
+
+    def to_link(self, i: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Express world points in the frame of a solid's link."""
+        T = self._link_poses[self._row[i]]
+        return (points - T[:3, 3]) @ T[:3, :3]
+
+    def plane_gaps(self, plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n"]:
+        """Signed distance from each solid to the half-space {x : n . x < offset}, exact, metres."""
+        normal = plane[:3]
+        local = np.abs(np.einsum("nij,i->nj", self.R, normal))  # in each solid's frame
+        reach = np.einsum("ni,ni->n", local, self._halves)
+        reach += self._rims * np.hypot(local[:, 0], local[:, 1]) + self._balls
+        gaps = self.t @ normal - plane[3] - reach
+        for i in self._meshes:
+            gaps[i] = self.lowest_point(int(i), normal) @ normal - plane[3]
+        return gaps
+
+    def lowest_point(self, i: int, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """World point of a solid that lies farthest against a direction."""
+        solid = self.solids[i]
+        if solid.vertices is not None:
+            T = self._link_poses[self._row[i]]
+            return (
+                T[:3, :3] @ solid.vertices[np.argmin(solid.vertices @ (T[:3, :3].T @ normal))]
+                + T[:3, 3]
+            )
+        local = self.R[i].T @ normal
+        point = -self._balls[i] * local - np.sign(local) * self._halves[i]
+        across = np.hypot(local[0], local[1])
+        if across > 0.0:
+            point[:2] -= self._rims[i] * local[:2] / across
+        return self.R[i] @ point + self.t[i]
+
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """Pairs of solids of the link pairs that the robot tests against each other."""
+        of_link = {link: np.flatnonzero(self.links == link) for link in np.unique(self.links)}
+        empty = np.empty(0, dtype=np.int64)
+        rows = [
+            pair
+            for a, b in self.robot.collision_pairs
+            for pair in itertools.product(of_link.get(a, empty), of_link.get(b, empty))
+        ]
+        return np.array(rows, dtype=np.int64).reshape(-1, 2)
+
+    def motion_bound(self, delta: Float[np.ndarray, "dof"]) -> float:
+        """Bound the way of any point of any solid while the joints change by `delta`, metres."""
+        return float(np.max(np.abs(delta) @ self._levers, initial=0.0))
+
+    def _lever_table(self) -> Float[np.ndarray, "dof links"]:
+        """Metres that any point of a link can move per unit of each joint.
+
+        The table of the checker bounds the sphere centres; a solid's farthest point is at
+        most the way to the nearest sphere centre and the solid's ball beyond that.
+        """
+        arrays = self.robot.arrays
+        in_link = _spheres_in_links(self.robot)
+        beyond = np.zeros(len(self.robot.link_names))
+        for solid in self.solids:
+            own = in_link[self.robot.sphere_links == solid.link]
+            way = float(np.min(np.linalg.norm(own - solid.center, axis=1)))
+            beyond[solid.link] = max(beyond[solid.link], way + solid.radius)
+        table = reach_table(arrays)
+        turning = (arrays.kind == 1)[:, None]
+        levers = np.where(table >= 0.0, table + np.where(turning, beyond, 0.0), 0.0)
+        out = np.zeros((self.robot.dof, levers.shape[1]))
+        for frame in range(1, len(arrays.parent)):
+            out[arrays.q_index[frame]] += abs(arrays.q_mult[frame]) * levers[frame]
+        return out

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the distance field and the meshes disagree, and why."""
+
+import math
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.collision import _fcl
+from vprism_plan.collision._mesh_world import MeshWorld
+from vprism_plan.collision.mesh_reports import Cause, CauseKind, Comparison, Disagreement
+from vprism_plan.collision.protocols import Numbers
+from vprism_plan.collision.reports import Contact
+from vprism_plan.errors import RobotError
+from vprism_plan.robots import Robot
+
+_TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
+# Grid steps that the field may refuse beyond a surface: its interpolation gives up less than
+# one (half a cell's diagonal), its cover less than half.
+_INFLATION = 1.5
+_UNSEEN: dict[str, CauseKind] = {
+    "occluded": "occluded",
+    "unobserved": "unobserved",
+    "background": "background",
+}
+
+
+@runtime_checkable
+class SurfaceChecker(Protocol):
+    """What a comparison asks of `MeshChecker`."""
+
+    robot: Robot
+    surfaces: MeshWorld
+
+    def is_valid(self, q: Numbers) -> bool:
+        """Verdict on a configuration."""
+        ...
+
+    def contacts(self, q: Numbers) -> tuple[Contact, ...]:
+        """Reasons to refuse it."""
+        ...
+
+    def allows(self, link: str, body: str) -> bool:
+        """Whether a link may touch a body."""
+        ...
+
+    def link_distance(self, q: Numbers, link: str, body: str) -> float:
+        """Distance from a link to a body, metres."""
+        ...
+
+
+def compare(checker: Any, mesh_checker: SurfaceChecker, Q: Numbers) -> Comparison:
+    """Compare the verdicts of the field and of meshes, and name a cause for every difference.
+
+    Args:
+        checker: a `CollisionChecker`.
+        mesh_checker: the second opinion, on the same world and robot.
+        Q: (n, dof) finite configurations.
+
+    Returns:
+        The comparison. A disagreement has one cause per contact of the checker that
+        refuses: each of them alone would have made the difference.
+
+    Raises:
+        RobotError: Q does not have shape (n, dof) or is not finite.
+    """
+    rows = np.asarray(Q, dtype=np.float64)
+    if rows.ndim != 2:
+        raise RobotError(f"Q has shape {rows.shape}; it must be (n, {mesh_checker.robot.dof})")
+    both, neither, found = 0, 0, []
+    for index, row in enumerate(rows):
+        q = mesh_checker.robot.check_configuration(row)
+        by_field, by_mesh = bool(checker.is_valid(q)), mesh_checker.is_valid(q)
+        if by_field == by_mesh:
+            both += by_field
+            neither += not by_field
+            continue
+        causes = causes_between(checker, mesh_checker, q)
+        found.append(Disagreement(index, by_field, by_mesh, causes))
+    return Comparison(both, neither, tuple(found))
+
+
+def causes_between(
+    checker: Any, mesh_checker: SurfaceChecker, q: Float[np.ndarray, "dof"]
+) -> tuple[Cause, ...]:
+    """Name why the two disagree on q; "edge tolerance" if both refuse it, empty if none does."""
+    by_field = checker.explain(q)
+    touching = mesh_checker.contacts(q)
+    if by_field.valid:
+        return tuple(_of_mesh(checker, mesh_checker, contact, q) for contact in touching)
+    if touching:
+        return tuple(Cause("edge tolerance", c.link, c.body, c.depth) for c in touching)
+    return tuple(_of_field(checker, mesh_checker, contact, q) for contact in by_field.contacts)
+
+
+# --- the field refuses, meshes accept ------------------------------------------------
+
+
+def _of_field(
+    checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
+) -> Cause:
+    kind: CauseKind
+    amount = contact.depth
+    if contact.body in _UNSEEN:
+        kind = _UNSEEN[contact.body]
+    elif contact.kind == "risk":
+        kind = "posterior risk"
+    elif contact.kind == "object" and meshes.allows(contact.link, contact.body):
+        kind = "contact rules"
+    elif contact.kind == "self" or contact.body in checker.world.plane_names:
+        # Both are exact for spheres: what is left is the margin, or what spheres add.
+        own = contact.kind == "self"
+        margin = checker.config.self_margin if own else checker.config.margin
+        kind = "conservative spheres" if contact.depth > margin else "margin"
+        amount = meshes.link_distance(q, contact.link, contact.body)
+    elif contact.kind in {"object", "known"} and contact.sphere >= 0:
+        kind, amount = _of_surface(checker, meshes, contact, q)
+    else:
+        kind = "unexplained"
+    return Cause(kind, contact.link, contact.body, float(amount))
+
+
+def _of_surface(
+    checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
+) -> tuple[CauseKind, float]:
+    """Cause and amount where the field refuses a sphere for an object or known geometry."""
+    margin = float(checker.config.margin)
+    center, radius = sphere_at(meshes, q, contact.sphere)
+    gap = _ball_gap(meshes, center, radius, contact.body)
+    if gap <= _TOLERANCE:
+        return "conservative spheres", meshes.link_distance(q, contact.link, contact.body)
+    if gap <= margin:
+        return "margin", gap
+    if contact.kind == "object":
+        if not _level_set_refuses(checker, center, radius):
+            return "thin seen part", contact.depth
+        if contact.body not in {body.name for body in meshes.surfaces.bodies}:
+            return "too small for the mesh", contact.depth
+    within = margin + _INFLATION * float(checker.world.field.spacing)
+    return "voxel inflation" if gap <= within else "unexplained", gap
+
+
+def sphere_at(
+    meshes: SurfaceChecker, q: Float[np.ndarray, "dof"], sphere: int
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """World centre and radius of a collision sphere, metres."""
+    import torch
+
+    center = meshes.robot.sphere_centers(torch.from_numpy(q)).numpy()[sphere]
+    return center, float(meshes.robot.sphere_radii[sphere])
+
+
+def _ball_gap(
+    meshes: SurfaceChecker, center: Float[np.ndarray, "3"], radius: float, named: str
+) -> float:
+    """Signed distance of a ball to the surfaces of the kind that a contact names.
+
+    For an object: to any of them, since the field names the nearest to a grid node.
+    """
+    surfaces = meshes.surfaces
+    objects = named.startswith("object:")
+    inside = objects and surfaces.object_at(center[None])[0] > 0
+    best = math.inf
+    for body in surfaces.bodies:
+        if body.name != named and not (objects and body.class_index):
+            continue
+        if not body.shape.hollow:
+            ball = _fcl.Shape("sphere", (radius,))
+            ball.place(np.eye(3), center)
+            best = min(best, _fcl.signed_gap(body.shape, ball))
+            continue
+        way, _ = _fcl.point_distance(body.shape, center)
+        hidden = inside if objects else body.contains(center)
+        best = min(best, (-way if hidden else way) - radius)
+    return best
+
+
+def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: float) -> bool:
+    """Whether the objects' level sets alone, without thin seen parts, refuse a sphere."""
+    world = checker.world
+    nearest = min(
+        float(world.object_field(i).lower_bound(center[None])[0]) for i in world.map.object_ids
+    )
+    return nearest - radius <= checker.config.margin
+
+
+# --- meshes refuse, the field accepts ------------------------------------------------
+
+
+def _of_mesh(
+    checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
+) -> Cause:
+    kind: CauseKind = "missed by the field"
+    links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
+    if contact.position is None:
+        kind = "unexplained"  # a joint limit: both know the same
+    elif contact.kind == "object" and _field_allows(checker, contact):
+        kind = "contact rules"
+    elif contact.kind == "object" and checker.config.max_risk is not None:
+        kind = "posterior risk"  # draws judge the objects there, not the level set
+    elif contact.depth <= _TOLERANCE:
+        kind = "rounding"
+    elif contact.sphere < 0 and not _in_spheres(meshes, q, links, np.array(contact.position)):
+        kind = "solids outside spheres"
+    elif contact.kind == "object" and not _in_level_set(checker, contact):
+        kind = "coarse mesh"
+    return Cause(kind, contact.link, contact.body, contact.depth)
+
+
+def _in_level_set(checker: Any, contact: Contact) -> bool:
+    """Whether the map calls the point of contact, or the deepest one behind it, occupied."""
+    point = np.array(contact.position)
+    deepest = point - contact.depth * np.array(contact.normal)
+    occupied = np.asarray(checker.world.map.occupancy(np.stack([point, deepest])))
+    return bool((occupied >= checker.world.config.level).any())
+
+
+def _field_allows(checker: Any, contact: Contact) -> bool:
+    """Whether the field's checker lets the link touch the object."""
+    object_id = int(contact.body.split(":", 1)[1])
+    return any(
+        object_id in ids and contact.link in checker.robot.links_of(name)
+        for name, ids in checker.config.allowed_contacts.items()
+    )
+
+
+def _in_spheres(
+    meshes: SurfaceChecker,
+    q: Float[np.ndarray, "dof"],
+    links: tuple[str, ...],
+    point: Float[np.ndarray, "3"],
+) -> bool:
+    """Whether the collision spheres of each link hold a world point, to FCL's tolerance."""
+    import torch
+
+    robot = meshes.robot
+    centers = robot.sphere_centers(torch.from_numpy(q)).numpy()
+    held = np.linalg.norm(centers - point, axis=1) <= robot.sphere_radii + _TOLERANCE
+    owners = {robot.link_names[int(link)] for link in robot.sphere_links[held]}
+    return owners >= set(links)
