@@ -10,19 +10,18 @@ from jaxtyping import Bool, Float
 from vprism_plan._kernels import checking as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.collision import _explain
-from vprism_plan.collision._packing import pack_robot, pack_world, require_prismatic_limits
+from vprism_plan.collision._packing import pack_robot, pack_world
 from vprism_plan.collision._path_risk import PathRisk
+from vprism_plan.collision._queries import Queries
 from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.contacts import contact_rules
 from vprism_plan.collision.protocols import (
     BakedWorld,
     NodeField,
     Numbers,
-    RuledWorld,
     SphereRobot,
 )
-from vprism_plan.collision.reports import Contact, MotionReport, StateReport
-from vprism_plan.collision.risk import RiskEstimate
+from vprism_plan.collision.reports import MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
 
 _BATCH_CHUNK = 512
@@ -41,7 +40,7 @@ def interpolate(
     return qa + t * (delta - 2.0 * np.pi * turns)
 
 
-class CollisionChecker:
+class CollisionChecker(Queries):
     """Answers whether configurations and edges of a robot are free of a world.
 
     A configuration is valid when its joints are within their limits, every collision
@@ -153,12 +152,7 @@ class CollisionChecker:
         Raises:
             RobotError: q does not have shape (dof,) or is not finite.
         """
-        q = self._configuration(q)
-        if not np.isfinite(q).all():
-            raise RobotError(f"configuration is {q.tolist()}; clearance needs finite joint values")
-        world, own = np.empty(1), np.empty(1)
-        kernels.clearance_batch(q[None], self._rf, self._ri, *self._surfaces, world, own)
-        return float(world[0])
+        return float(self._clearances(self._configuration(q)[None])[0][0])
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return `clearance` for each row of Q (n, dof), metres."""
@@ -213,11 +207,6 @@ class CollisionChecker:
             risk=risk,
         )
 
-    @property
-    def max_risk(self) -> float | None:
-        """Bound on the probability of collision of what is valid, or None."""
-        return self.config.max_risk
-
     def tightened(self, level: int) -> "CollisionChecker | None":
         """Return a checker with a stricter bound on risk; None if there is no stricter one.
 
@@ -238,58 +227,6 @@ class CollisionChecker:
         stricter._bounded = bounded
         return stricter
 
-    def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
-        """Return the probability that a path (or a configuration) touches anything.
-
-        The share of worlds, drawn from the map's posterior, in which any sphere of any
-        moving link comes within `config.margin` of an occupied voxel that it may not touch,
-        or of a certain obstacle, anywhere on the path: the same world for the whole path.
-        Edges are straight in joint space and swept without gaps. Self-collision and joint
-        limits do not enter.
-
-        Args:
-            path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
-            held_out: ask other worlds than those that `max_risk` is checked with. A path
-                that a planner found with this checker was selected by the worlds it was
-                checked with, so their verdict on it is too mild.
-
-        Raises:
-            RobotError: a wrong shape, a value that is not finite, or a prismatic joint
-                outside its limits (no bound on the motion holds there).
-        """
-        array = np.ascontiguousarray(path, dtype=np.float64)
-        rows = array[None] if array.ndim == 1 else array
-        if rows.ndim != 2 or rows.shape[1] != self._dof or len(rows) == 0:
-            raise RobotError(
-                f"path has shape {array.shape}; {self.robot.name} needs (T, {self._dof}) or "
-                f"({self._dof},): {', '.join(self.robot.joint_names)}"
-            )
-        if not np.isfinite(rows).all():
-            row = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
-            raise RobotError(f"waypoint {row} is {rows[row].tolist()}; give finite joint values")
-        if self._slides:
-            require_prismatic_limits(self.robot, rows)
-        risk = self._risk()
-        if held_out:
-            risk = risk.held_out()
-        return risk.estimate_at(rows[0]) if len(rows) == 1 else risk.estimate(rows)
-
-    def _ruled_world(self) -> RuledWorld:
-        if not isinstance(self.world, RuledWorld):
-            raise ConfigError(
-                f"probabilities and allowed contacts need a vprism_plan.World; "
-                f"{type(self.world).__name__} has no posterior and no fields per object"
-            )
-        return self.world
-
-    def _risk(self) -> PathRisk:
-        with self._lock:
-            if self._path_risk is None:
-                self._path_risk = PathRisk(
-                    self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
-                )
-            return self._path_risk
-
     def explain(self, q: Numbers) -> StateReport:
         """Return the verdict on a configuration with every reason that refuses it.
 
@@ -305,13 +242,6 @@ class CollisionChecker:
     def allowed_objects(self, link: int) -> frozenset[int]:
         """Return the ids of the objects that a link (index) may touch."""
         return self._rules[int(self._link_rules[link])]
-
-    def risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
-        """Return what makes a configuration too risky; empty if it is not, or has no bound."""
-        bounded = self._bounded
-        if bounded is None or bounded.hits_at(q) <= bounded.allowed:
-            return ()
-        return bounded.contacts(q)
 
     def sphere_clearances(
         self, q: Float[np.ndarray, "dof"]
