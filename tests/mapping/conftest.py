@@ -28,11 +28,11 @@ class Problem:
     prior_mean: np.ndarray
     variance: np.ndarray
 
-    def fit(self, iterations: int = 4, updates: int = 1) -> Posterior:
+    def fit(self, iterations: int = 4, updates: int = 1, relaxation: float = 1.0) -> Posterior:
         prior = diagonal_prior(self.space, self.prior_mean, self.variance)
         return fit_weights(
             self.space, block_features(self.space, self.points), self.labels, prior,
-            iterations=iterations, variational_updates=updates,
+            iterations=iterations, variational_updates=updates, relaxation=relaxation,
         )  # fmt: skip
 
 

@@ -167,3 +167,40 @@ def test_a_label_that_is_no_class_is_refused(make):
     problem.labels[7] = 3
     with pytest.raises(MapError, match=r"0\.\.2"):
         problem.fit()
+
+
+@settings(max_examples=8)
+@given(
+    seed=st.integers(0, 10**6), classes=st.integers(2, 8), scale=st.sampled_from([0.05, 1.0, 300.0])
+)
+def test_longer_steps_never_lower_the_bound(make, seed, classes, scale):
+    problem = make(seed, classes, n=40, hinges=10)
+    problem.variance = problem.variance * scale
+    history = np.array(problem.fit(8, 2, relaxation=1.9).history)
+    assert (np.diff(history) >= -1e-9 * np.abs(history[1:])).all()
+
+
+def test_longer_steps_reach_the_same_posterior_sooner(make):
+    """Both climb to one optimum; six long steps get farther than ten plain ones."""
+    problem = make(2, 4, n=60, hinges=15)
+    assert problem.fit(6, relaxation=1.9).history[-1] > problem.fit(10).history[-1]
+    problem.variance = np.full(problem.space.size, 0.5)  # a firm prior converges soon
+    plain, relaxed = problem.fit(100), problem.fit(50, relaxation=1.9)
+    assert relaxed.history[-1] == pytest.approx(plain.history[-1], rel=1e-8)
+    np.testing.assert_allclose(relaxed.mean, plain.mean, atol=2e-3)
+
+
+def test_a_step_that_lowers_the_bound_is_taken_back(make, monkeypatch):
+    """One wild step: the history goes on as if it had never been."""
+    from vprism_plan.mapping import em
+
+    problem = make(4, 3)
+    towards = em._Variational.towards
+    wild = [False, True, False, False, False]
+
+    def jump(self, step, factor):
+        return towards(self, step, 60.0 if wild.pop(0) else 1.0)
+
+    plain = problem.fit(4).history
+    monkeypatch.setattr(em._Variational, "towards", jump)
+    assert problem.fit(5, relaxation=1.5).history == pytest.approx(plain, rel=1e-12)

@@ -110,6 +110,23 @@ def divergence(space: FeatureSpace, posterior: Posterior, prior: Prior) -> float
     return float(0.5 * (trace + quadratic - space.size + gap).sum())
 
 
+@dataclass(frozen=True, eq=False)
+class _Variational:
+    """The parameters of Bouchard's bound, per point and per point and class."""
+
+    alpha: Float[np.ndarray, " n"]
+    xi: Float[np.ndarray, "n k"]
+
+    def towards(self, step: "_Variational", factor: float) -> "_Variational":
+        """Go `factor` times as far as from here to `step`."""
+        if factor == 1.0:
+            return step
+        start, stop = np.maximum(self.xi, 1e-6), np.maximum(step.xi, 1e-6)
+        return _Variational(
+            self.alpha + factor * (step.alpha - self.alpha), start * (stop / start) ** factor
+        )
+
+
 def _row_pieces(space: FeatureSpace, features: BlockFeatures) -> list[tuple[int, int]]:
     """Split the envelope rows into pieces of about equal work, for threads."""
     work = np.bincount(features.near, minlength=space.size).astype(float)
@@ -166,11 +183,18 @@ def fit_weights(
     iterations: int,
     variational_updates: int = 1,
     tolerance: float = 0.0,
+    relaxation: float = 1.0,
 ) -> Posterior:
     """Run EM from xi = 1, alpha = 0 and return the posterior of all classes.
 
     `labels` (class per point, 0 is empty) follow the points as given, not the blocks.
     Stops after `iterations`, or when the bound rises by less than `tolerance` of itself.
+
+    `relaxation` above 1 goes that many times as far as a step of EM: xi by the power of
+    its ratio, alpha by the multiple of its change. Where that lowers the bound, the
+    posterior is dropped and the plain step taken from the last good one instead, so the
+    history never falls (Salakhutdinov and Roweis, "Adaptive overrelaxed bound
+    optimization methods", ICML 2003). A dropped step counts as an iteration.
 
     Raises:
         MapError: a label is not a class, or a precision matrix cannot be factorised.
@@ -185,28 +209,34 @@ def fit_weights(
     kernels.envelope_product(
         prior.precision, space.row_first, space.base, prior.mean, prior_information
     )
-    weight = bouchard_lambda(np.ones((len(labels), classes)))
-    alpha = np.zeros(len(labels))
-    mean, covariance = np.empty_like(prior.mean), np.empty_like(prior.precision)
+    used = _Variational(np.zeros(len(labels)), np.ones((len(labels), classes)))
+    plain, relaxed = used, False
     history: list[float] = []
     posterior: Posterior | None = None
     for _ in range(iterations):
+        weight = bouchard_lambda(used.xi)
         precision = prior.precision.copy()
         _accumulate(space, features, 2.0 * weight, precision)
         information = prior_information.copy()
-        linear = one_hot - 0.5 + 2.0 * alpha[:, None] * weight
+        linear = one_hot - 0.5 + 2.0 * used.alpha[:, None] * weight
         kernels.feature_sums(*features.arguments, linear, information)
+        mean, covariance = np.empty_like(prior.mean), np.empty_like(prior.precision)
         log_determinant = invert_classes(space, precision, information, mean, covariance)
-        posterior = Posterior(mean, covariance, precision, log_determinant, ())
+        found = Posterior(mean, covariance, precision, log_determinant, ())
         m, v = logit_moments(space, features, mean, covariance)
         for _ in range(variational_updates):
             alpha = update_alpha(m, weight)
             xi = update_xi(m, v, alpha)
             weight = bouchard_lambda(xi)
-        bound = expected_bound(m, v, alpha, xi, labels) - divergence(space, posterior, prior)
-        history.append(bound)
+        bound = expected_bound(m, v, alpha, xi, labels) - divergence(space, found, prior)
         if not np.isfinite(bound):
             raise MapError("the evidence bound is not finite; lower the prior variance")
+        if relaxed and bound < history[-1]:
+            used, relaxed = plain, False
+            continue
+        posterior, plain = found, _Variational(alpha, xi)
+        used, relaxed = used.towards(plain, relaxation), relaxation > 1.0
+        history.append(bound)
         if len(history) > 1 and history[-1] - history[-2] <= tolerance * abs(history[-2]):
             break
     assert posterior is not None

@@ -196,6 +196,7 @@ def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapCon
         space, features, data.classes, prior,
         iterations=config.iterations,
         variational_updates=config.variational_updates,
+        relaxation=config.relaxation,
         tolerance=config.tolerance,
     )  # fmt: skip
 
