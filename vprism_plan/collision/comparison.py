@@ -128,8 +128,9 @@ def _of_surface(
     margin = float(checker.config.margin)
     center, radius = sphere_at(meshes, q, contact.sphere)
     gap = _ball_gap(meshes, center, radius, contact.body)
-    if gap <= _TOLERANCE:
-        return "conservative spheres", meshes.link_distance(q, contact.link, contact.body)
+    left = meshes.link_distance(q, contact.link, contact.body)
+    if gap <= _TOLERANCE and left > gap + _TOLERANCE:
+        return "conservative spheres", left
     if gap <= margin:
         return "margin", gap
     if contact.kind == "object":
