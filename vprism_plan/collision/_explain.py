@@ -9,6 +9,7 @@ from vprism_plan.collision.reports import Contact, Kind, StateReport
 
 _STATUS_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
 _SAMPLES = 96
+_AROUND = 2  # nodes beyond a point's cell that are asked for the nearest obstacle's name
 
 
 def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
@@ -205,7 +206,12 @@ def _allowed_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Con
 def nearest_source(
     world: BakedWorld, field: NodeField, point: Float[np.ndarray, "3"]
 ) -> tuple[str, Float[np.ndarray, "3"]]:
-    """Return the name of the obstacle nearest to a point and the direction away from it."""
+    """Return the name of the obstacle nearest to a point and the direction away from it.
+
+    A node at the distance d from an obstacle says that it is at most d plus the way to the
+    node from the point. The smallest such sum over the nodes around names the nearest one
+    to within a fraction of a voxel: some node lies close to the way there.
+    """
     shape = np.array(field.distance.shape)
     g = (point - field.origin) / field.spacing
     outside = world.config.unobserved == "occupied" and (np.any(g < 0) or np.any(g > shape - 1))
@@ -213,8 +219,12 @@ def nearest_source(
     cell = np.minimum(inside.astype(int), shape - 2)
     corners = cell + np.indices((2, 2, 2)).reshape(3, -1).T
     values = np.asarray(field.distance[tuple(corners.T)], dtype=np.float64)
-    bounds = values - field.spacing * np.linalg.norm(inside - corners, axis=1)
-    nearest = corners[int(np.argmax(bounds))]
+    low, high = np.maximum(cell - _AROUND, 0), np.minimum(cell + _AROUND + 2, shape)
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    nodes = low + np.moveaxis(np.indices(tuple(high - low)), 0, -1)
+    ways = np.asarray(field.spacing * np.linalg.norm(nodes - inside, axis=-1))
+    ways += np.maximum(field.distance[window], 0.0)
+    nearest = low + np.array(np.unravel_index(int(np.argmin(ways)), ways.shape))
     slope = values.reshape(2, 2, 2)
     gradient = np.array([np.mean(np.diff(slope, axis=axis)) for axis in range(3)], dtype=np.float64)
     if outside:
