@@ -111,7 +111,7 @@ def training_data(
     rng: np.random.Generator,
 ) -> TrainingData:
     """Observed points, negative samples and their subsampling (section V)."""
-    clouds = [_without_strays(*view.points(), config.stray_share) for view in views]
+    clouds = [_without_strays(*_marked_points(view), config.stray_share) for view in views]
     points = np.concatenate([cloud for cloud, _ in clouds])
     labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
     lower, upper = negatives.box_centers(points, labels, object_ids, config.box_trim)
@@ -152,6 +152,16 @@ def training_data(
         surface,
         np.asarray(object_ids, np.int64)[index],
     )
+
+
+def _marked_points(view: Observation) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """One view's points and labels, -1 where it sees the robot.
+
+    The ray before such a point is as empty as any other. The point itself says nothing:
+    if it should belong to what the robot holds, calling it empty would carve that away.
+    """
+    points, labels = view.points()
+    return points, np.where(view.sees_robot[view.depth > 0], -1, labels)
 
 
 def _without_strays(

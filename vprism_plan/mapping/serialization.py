@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1
 _HEADER = "vprism_plan"
-_VIEW_PARTS = ("depth", "labels", "intrinsics", "T_world_camera", "color")
+_VIEW_PARTS = ("depth", "labels", "intrinsics", "T_world_camera", "color", "robot_spheres")
 
 
 def save_map(fitted: "VPrismMap", path: str | Path) -> None:

@@ -8,12 +8,15 @@ from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane
 from vprism_plan.perception.saving import save_observation
 from vprism_plan.perception.segmentation import segment_tabletop
+from vprism_plan.perception.self_filter import ignore_robot, ignore_self
 
 __all__ = [
     "Observation",
     "Plane",
     "align_to_table",
     "fit_plane",
+    "ignore_robot",
+    "ignore_self",
     "load_observation",
     "save_observation",
     "segment_tabletop",

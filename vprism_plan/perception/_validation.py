@@ -176,3 +176,22 @@ def check_color(value: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"shape {(*shape, 3)}, registered to the depth"
         )
     return np.ascontiguousarray(color)
+
+
+def check_robot_spheres(value: Any) -> np.ndarray:
+    """Return (S, 4) float64 rows (x, y, z, radius), metres."""
+    spheres = to_numpy(value, "robot_spheres")
+    if spheres.ndim != 2 or spheres.shape[1] != 4 or spheres.dtype.kind not in "fiu":
+        raise ObservationError(
+            f"robot_spheres have shape {spheres.shape} and type {spheres.dtype}; they must be "
+            "rows (x, y, z, radius) in metres, camera frame"
+        )
+    spheres = spheres.astype(np.float64)
+    bad = ~(np.isfinite(spheres).all(axis=1) & (spheres[:, 3] > 0.0))
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise ObservationError(
+            f"row {row} of robot_spheres is {spheres[row].tolist()}; centre and radius must be "
+            "finite and the radius positive"
+        )
+    return np.ascontiguousarray(spheres)

@@ -63,6 +63,7 @@ def _origin(obs: Observation, plane: Plane) -> Float[np.ndarray, " 3"]:
     points, labels = unposed.points()
     chosen = points[labels > 0]
     if not len(chosen):
+        points = points[~obs.sees_robot[obs.depth > 0]]
         band = inlier_band(points[:, 2], 0.01)
         chosen = points[np.abs(plane.signed_distance(points)) < band]
     if not len(chosen):

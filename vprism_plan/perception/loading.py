@@ -18,7 +18,15 @@ from vprism_plan.perception._bop import load_bop
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
-_NPZ_KEYS = ("depth", "labels", "intrinsics", "T_world_camera", "color", "plane")
+_NPZ_KEYS = (
+    "depth",
+    "labels",
+    "intrinsics",
+    "T_world_camera",
+    "color",
+    "plane",
+    "robot_spheres",
+)
 # What numpy, zipfile and zlib raise on a damaged archive.
 _UNREADABLE = (
     OSError,
@@ -39,10 +47,11 @@ def load_observation(path: str | Path, *, frame: int | None = None) -> Observati
     """Load an observation; its form is recognised from the path.
 
     - `.npz` (read without pickle): `depth` (metres, float) and `intrinsics` (3x3);
-      optional `labels`, `T_world_camera`, `color`, `plane` (normal and offset).
+      optional `labels`, `T_world_camera`, `color`, `plane` (normal and offset),
+      `robot_spheres` (rows x, y, z, radius; camera frame).
     - a folder: `depth.png` (16-bit), `camera.json` with `fx fy cx cy` (pixels) and
-      `depth_scale` (metres per raw unit), optional `T_world_camera` (4x4) and `plane`;
-      optional `labels.png` and `color.png`.
+      `depth_scale` (metres per raw unit), optional `T_world_camera` (4x4), `plane`
+      and `robot_spheres`; optional `labels.png` and `color.png`.
     - a BOP scene folder (`scene_camera.json`, `depth/`, millimetres): `frame` picks the
       image, default the first; labels are the ground-truth index + 1 from
       `mask_visib/`, the pose comes from `cam_R_w2c`, `cam_t_w2c` where present.
@@ -105,6 +114,7 @@ def _load_npz(path: Path) -> Observation:
         content.get("T_world_camera"),
         content.get("color"),
         _plane(content.get("plane"), "plane"),
+        content.get("robot_spheres"),
     )
 
 
@@ -155,4 +165,5 @@ def _assemble(depth: Path, camera: Path, labels: Path, color: Path) -> Observati
         pose,
         _files.read_color_image(color) if color.is_file() else None,
         _plane(content.get("plane"), f"{camera}: 'plane'"),
+        content.get("robot_spheres"),
     )

@@ -6,11 +6,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Bool, Float, Int32
 
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import _validation
-from vprism_plan.perception.camera import point_image
+from vprism_plan.perception.camera import backproject, ball_window, point_image
 from vprism_plan.perception.plane import Plane
 
 
@@ -29,6 +29,9 @@ class Observation:
             and then the world frame *is* the camera frame.
         color: (H, W, 3) uint8 RGB, or None.
         plane: support plane in the world frame if it is known.
+        robot_spheres: (S, 4) float64 rows (x, y, z, radius), metres, *camera* frame: balls
+            that held the robot when the image was taken (`ignore_robot` sets them); None =
+            nobody said where it was. Pixels that see it are background whatever `labels` say.
 
     Raises:
         ObservationError: what is wrong, what would be valid, and the remedy.
@@ -40,6 +43,7 @@ class Observation:
     T_world_camera: Any = None
     color: Any = None
     plane: Any = None
+    robot_spheres: Any = None
 
     def __post_init__(self) -> None:
         depth = _validation.check_depth(self.depth)
@@ -55,8 +59,12 @@ class Observation:
             checked["color"] = _validation.check_color(self.color, depth.shape)
         if self.plane is not None and not isinstance(self.plane, Plane):
             raise ObservationError(f"plane is a {type(self.plane).__name__}; give a Plane or None")
+        if self.robot_spheres is not None:
+            checked["robot_spheres"] = _validation.check_robot_spheres(self.robot_spheres)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+        if self.labels is not None and self.robot_spheres is not None:
+            self.labels[self.sees_robot] = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -77,6 +85,25 @@ class Observation:
     def camera_center(self) -> Float[np.ndarray, " 3"]:
         """Optical centre in the world frame, metres."""
         return self.pose[:3, 3]
+
+    @cached_property
+    def sees_robot(self) -> Bool[np.ndarray, "h w"]:
+        """Pixels whose point lies in one of `robot_spheres`.
+
+        What they see is neither an object nor background: it moves. The ray up to it is
+        free, and what lies behind it is hidden.
+        """
+        seen = np.zeros(self.shape, dtype=bool)
+        if self.robot_spheres is None:
+            return seen
+        points = backproject(self.depth, self.intrinsics)
+        for x, y, z, radius in self.robot_spheres.tolist():
+            window = ball_window((x, y, z), radius, self.intrinsics, self.shape)
+            part = points[window]
+            # NaN, where there is no return, is not within anything.
+            square = ((part - np.array([x, y, z])) ** 2).sum(axis=-1)
+            seen[window] |= square <= radius * radius
+        return seen
 
     @cached_property
     def object_ids(self) -> tuple[int, ...]:
@@ -115,7 +142,8 @@ class Observation:
     def points(self) -> tuple[Float[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]:
         """World points (metres) of the pixels with a return, row by row, and their labels.
 
-        Labels are all 0 if the observation is not segmented.
+        Labels are all 0 if the observation is not segmented. Points of the robot
+        (`sees_robot`) are among them, with label 0.
         """
         valid = self.depth > 0
         points = self.point_image()[valid]

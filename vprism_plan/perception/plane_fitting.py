@@ -49,7 +49,8 @@ def fit_plane(
     refined by least squares. Of these the support plane is the one that most points
     belong to *and stand on*: an empty floor behind the table or a wall has no objects
     within 0.4 m above its visible extent (other large planes do not count as objects).
-    Points labelled as objects only vote as things that stand on a plane.
+    Points labelled as objects only vote as things that stand on a plane; points of the
+    robot (`ignore_robot`) do not vote.
 
     Args:
         obs: the observation; labels are used where they exist.
@@ -64,10 +65,11 @@ def fit_plane(
         ConfigError: `threshold` or `min_share` out of range.
     """
     _check_arguments(threshold, min_share)
-    points = backproject(obs.depth, obs.intrinsics)[obs.depth > 0]
+    valid = (obs.depth > 0) & ~obs.sees_robot
+    points = backproject(obs.depth, obs.intrinsics)[valid]
     is_object = np.zeros(len(points), dtype=bool)
     if obs.labels is not None:
-        is_object = obs.labels[obs.depth > 0] > 0
+        is_object = obs.labels[valid] > 0
     if (~is_object).sum() < 3:
         raise PlaneNotFoundError(
             f"{int((~is_object).sum())} background pixels have a depth return; at least 3 are "

@@ -47,6 +47,7 @@ def _save_npz(obs: Observation, path: Path) -> None:
         "T_world_camera": obs.T_world_camera,
         "color": obs.color,
         "plane": _plane_numbers(obs),
+        "robot_spheres": obs.robot_spheres,
     }
     present = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     write_atomically(
@@ -102,5 +103,7 @@ def _write_camera(obs: Observation, scale: float, path: Path) -> None:
         content["T_world_camera"] = obs.T_world_camera.tolist()
     if obs.plane is not None:
         content["plane"] = _plane_numbers(obs)
+    if obs.robot_spheres is not None:
+        content["robot_spheres"] = obs.robot_spheres.tolist()
     text = json.dumps(content, indent=2) + "\n"
     write_atomically(path, lambda stream: stream.write(text.encode()))

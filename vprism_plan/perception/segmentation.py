@@ -73,6 +73,8 @@ def segment_tabletop(
     between them; stacked objects stay one. Fragments of one object (a handle, the far
     wall of a cup) are joined to it. Labels run from 1, by falling visible area.
 
+    Pixels that see the robot (`ignore_robot`) are left out of all this.
+
     What is *not* labelled stays background, and so remains an obstacle: clutter too small,
     too large (`max_size`, `max_height`: walls, people) or not over the table top.
 
@@ -107,6 +109,7 @@ def segment_tabletop(
     plane = plane or obs.plane or fit_plane(unlabelled, seed=seed)
     points = unlabelled.point_image()
     height = np.nan_to_num(plane.signed_distance(points), nan=-np.inf)
+    height[obs.sees_robot] = -np.inf  # neither a surface nor something that stands on it
     region = _visible_table(plane, points, obs.depth, height)
     depth = obs.depth.copy()
     if remove_flying:

@@ -7,7 +7,7 @@ of the cell's far side. So shadows are never too small, whatever the cell's size
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.perception import Observation, Plane
+from vprism_plan.perception.camera import transform_points
 
 # Codes of points.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
@@ -23,6 +24,9 @@ _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
 _THIN = 0.003
+# Cells around the robot that it takes with it. Inside a cavity of occluded cells a field
+# whose nodes are two cells apart falls short of the distance by 2.8 cells at most.
+_ROOM = 2.0
 
 
 def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -55,12 +59,14 @@ class View:
             2^k x 2^k window that begins at (v, u) of depth plus tolerance; infinite
             where there is no return or the support plane was seen.
         holes: the same, 0 where there is no return and 1 elsewhere.
+        robot: (S, 4) balls that held the robot, world, metres: nothing else is there.
     """
 
     camera: Float[np.ndarray, "3 4"]
     optics: Float[np.ndarray, " 4"]
     reach: Float32[np.ndarray, "levels h w"]
     holes: Float32[np.ndarray, "levels h w"]
+    robot: Float[np.ndarray, "s 4"] = field(default_factory=lambda: np.empty((0, 4)))
 
 
 def _sparse_tables(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "levels h w"]:
@@ -85,6 +91,7 @@ def make_view(observation: Observation, tolerance: float, plane: Plane | None = 
     that ends on the support plane (within that noise) or under it has passed through
     free space only, as far as space above the plane goes: such pixels cast no shadow,
     or the coarse cells on a table seen at a glance would all hide behind one another.
+    The robot casts one always, however low it is.
     """
     K = observation.intrinsics
     depth = np.asarray(observation.depth, dtype=np.float64)
@@ -98,6 +105,7 @@ def make_view(observation: Observation, tolerance: float, plane: Plane | None = 
         on_plane = plane.signed_distance(points) < threshold
         if observation.labels is not None:
             on_plane &= observation.labels[valid] == 0
+        on_plane &= ~observation.sees_robot[valid]
         reach[valid] = np.where(on_plane, np.inf, reach[valid])
     rotation = observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
@@ -106,7 +114,17 @@ def make_view(observation: Observation, tolerance: float, plane: Plane | None = 
         optics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64),
         reach=_sparse_tables(reach.astype(np.float32)),
         holes=_sparse_tables(valid.astype(np.float32)),
+        robot=_robot_balls(observation),
     )
+
+
+def _robot_balls(observation: Observation) -> Float[np.ndarray, "s 4"]:
+    """The observation's robot in world coordinates."""
+    if observation.robot_spheres is None:
+        return np.empty((0, 4))
+    spheres: np.ndarray = observation.robot_spheres.copy()
+    spheres[:, :3] = transform_points(observation.pose, spheres[:, :3])
+    return spheres
 
 
 def classify_cells(
@@ -120,7 +138,10 @@ def classify_cells(
 
     Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that
     sees a cell outweighs any number that do not. Cells wholly under the support plane
-    are called FREE: the half-space answers for them.
+    are called FREE: the half-space answers for them. So are cells whose centre was inside
+    the robot (`Observation.robot_spheres`) in any view, or within two cells of it: it was
+    there, so nothing else is, and what a field of these cells rounds away must not refuse
+    the robot the place where it stood.
     """
     status = np.full(shape, kernels.UNOBSERVED, dtype=np.uint8)
     blocks = -(-shape[0] // _BLOCK)
@@ -148,19 +169,43 @@ def classify_cells(
             shape[0],
             16,
         )
+    for view in views:
+        for ball in view.robot:
+            _clear_ball(ball[:3], float(ball[3]) + _ROOM * spacing, origin, spacing, status)
     return status
+
+
+def _clear_ball(
+    middle: Float[np.ndarray, " 3"],
+    reach: float,
+    origin: Float[np.ndarray, " 3"],
+    spacing: float,
+    status: UInt8[np.ndarray, "nx ny nz"],
+) -> None:
+    """Call the cells whose centre lies in a ball free."""
+    center, radius = (middle - origin) / spacing - 0.5, reach / spacing
+    low = np.clip(np.ceil(center - radius), 0, status.shape).astype(np.int64)
+    high = np.clip(np.floor(center + radius) + 1, low, status.shape).astype(np.int64)
+    x, y, z = (np.arange(a, b) - c for a, b, c in zip(low, high, center, strict=True))
+    square = x[:, None, None] ** 2 + y[:, None] ** 2 + z**2
+    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    status[window][square <= radius**2] = kernels.FREE
 
 
 def classify_points(
     views: Sequence[View], points: Float[np.ndarray, "n 3"]
 ) -> UInt8[np.ndarray, " n"]:
-    """Status of every point: SEEN, OCCLUDED or UNOBSERVED."""
+    """Status of every point: SEEN, OCCLUDED or UNOBSERVED; SEEN also where the robot was."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     status = np.full(len(points), kernels.UNOBSERVED, dtype=np.uint8)
     for view in views:
         kernels.classify_points(
             points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
         )
+    for view in views:
+        for ball in view.robot:
+            square = ((points - ball[:3]) ** 2).sum(axis=1)
+            status[square <= ball[3] ** 2] = kernels.FREE
     return _OF_POINT[status]
 
 
@@ -171,12 +216,13 @@ def background_points(
 
     "Off" is `height` metres, or three standard deviations of the depth noise as it
     shows along the normal, if that is more. Without a plane every unlabelled point is.
+    Points of the robot are not background.
     """
     kept, widths = [], []
     for view in views:
         points, labels = view.points()
         depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
-        chosen = labels == 0
+        chosen = (labels == 0) & ~view.sees_robot[view.depth > 0]
         if plane is not None:
             threshold = np.maximum(height, 3.0 * _height_sigma(view, points, depth, plane))
             chosen &= plane.signed_distance(points) > threshold
