@@ -26,6 +26,7 @@ import numpy as np
 from numba import njit
 
 _INF = np.inf
+_MAX_TURN = 0.5  # radians per step of a sampled path: keeps the bend between samples small
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -656,9 +657,19 @@ def _edge_delta(qa, qb, ri, delta):
 
 
 @njit(cache=True, nogil=True)
+def _turned(delta, rf, ri):
+    """Sum of the angles by which the joints turn, mimicking ones included."""
+    total = 0.0
+    for f in range(1, ri[0]):
+        if ri[ri[8] + 3 * f + 1] == 1:
+            total += abs(rf[ri[16] + 14 * f + 12] * delta[ri[ri[8] + 3 * f + 2]])
+    return total
+
+
+@njit(cache=True, nogil=True)
 def count_steps(P, rf, ri, spacing, steps):
-    """Fill steps (n - 1,) so that no sphere centre moves more than `spacing` metres in one
-    step of an edge; return their sum."""
+    """Fill steps (n - 1,) so that in one step of an edge no sphere centre moves more than
+    `spacing` metres and all joints together turn by at most half a radian; return their sum."""
     delta = np.empty(ri[4])
     link_rate = np.empty(ri[2])
     pair_rate = np.empty(ri[3])
@@ -666,7 +677,7 @@ def count_steps(P, rf, ri, spacing, steps):
     for e in range(P.shape[0] - 1):
         _edge_delta(P[e], P[e + 1], ri, delta)
         motion_rates(delta, rf, ri, link_rate, pair_rate)
-        fastest = 0.0
+        fastest = _turned(delta, rf, ri) * spacing / _MAX_TURN
         for link in range(ri[2]):
             fastest = max(fastest, link_rate[link])
         steps[e] = max(1, int(np.ceil(fastest / spacing)))
@@ -694,11 +705,7 @@ def place_path(P, steps, rf, ri, C, slack):
     for e in range(P.shape[0] - 1):
         _edge_delta(P[e], P[e + 1], ri, delta)
         motion_rates(delta, rf, ri, link_rate, pair_rate)
-        turned = 0.0
-        for f in range(1, ri[0]):
-            if ri[ri[8] + 3 * f + 1] == 1:
-                value = rf[ri[16] + 14 * f + 12] * delta[ri[ri[8] + 3 * f + 2]]
-                turned += abs(value) / steps[e]
+        turned = _turned(delta, rf, ri) / steps[e]
         for t in range(steps[e] + 1):
             for j in range(dof):
                 q[j] = P[e, j] + (t / steps[e]) * delta[j]

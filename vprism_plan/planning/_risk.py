@@ -23,7 +23,8 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
     Args:
         checker: whose `max_risk` holds.
         attempt: plans with a checker.
-        time_limit: wall time in seconds after which no further attempt starts.
+        time_limit: wall time in seconds after which no further attempt starts; the time
+            spent on estimates (the first draws the worlds) does not count.
 
     Returns:
         The first path within the bound; otherwise the least risky one as "too_risky", or
@@ -36,7 +37,7 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
     level, spent = 0, 0.0
     current: Any = checker
     while current is not None:
-        left = time_limit - (time.perf_counter() - began)
+        left = time_limit - (time.perf_counter() - began - spent)
         if level > 0 and left <= 0.0:
             break
         result = attempt(current, left if level else time_limit, level)

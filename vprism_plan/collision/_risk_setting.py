@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Everything that counting colliding worlds needs, put together once."""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.collision._packing import pack_robot, pack_world
+from vprism_plan.collision.config import CheckerConfig
+from vprism_plan.collision.protocols import NodeField, RuledWorld, SphereRobot
+from vprism_plan.world import PosteriorWorlds
+
+# Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
+PADDINGS = (0.5, 1.0, 2.0)
+# Voxels between a sphere's surface and the farthest voxel it is compared with: the centre's
+# offset, half a voxel between samples, and room to spare.
+_ROOM = 2.5
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Setting:
+    """A robot among the worlds of one map.
+
+    Attributes:
+        world: what is an obstacle in every world.
+        robot: whose spheres are asked about.
+        config: margin, worlds, seed and confidence.
+        worlds: the draws.
+        radii: (S,) metres, the margin included.
+        tables: (rules,) the table of `worlds` that holds for each contact rule.
+        sphere_tables: (S,) the table that holds for each sphere; -1 is not checked.
+        fields: distance to the certain obstacles, one per contact rule.
+        packed: the same for the kernels: distances, block bounds, floats.
+        floats, ints: the robot for the kernels, without joint limits and link pairs.
+        spacing: no sphere centre moves more than this between two samples, metres.
+    """
+
+    world: RuledWorld
+    robot: SphereRobot
+    config: CheckerConfig
+    worlds: PosteriorWorlds
+    radii: Float[np.ndarray, " s"]
+    tables: Int[np.ndarray, " g"]
+    sphere_tables: Int[np.ndarray, " s"]
+    fields: tuple[NodeField, ...]
+    packed: tuple[np.ndarray, np.ndarray, np.ndarray]
+    floats: Float[np.ndarray, " f"]
+    ints: Int[np.ndarray, " i"]
+    spacing: float
+
+
+def make_setting(
+    world: RuledWorld,
+    robot: SphereRobot,
+    config: CheckerConfig,
+    rules: Sequence[Collection[int]],
+    link_rules: Int[np.ndarray, " l"],
+) -> Setting:
+    """Put a setting together.
+
+    Args:
+        world: a `vprism_plan.world.World`.
+        robot: the robot.
+        config: the checker's.
+        rules: object ids that may be touched, one set per contact rule.
+        link_rules: (links,) the rule of each link.
+    """
+    arrays = robot.arrays
+    moving = ~np.asarray(arrays.link_fixed)[arrays.sphere_link]
+    radii = arrays.sphere_radius + config.margin
+    resolution = float(world.field.spacing)
+    room = _ROOM if config.max_risk is None else _ROOM + PADDINGS[-1]
+    reach = float(np.max(radii[moving], initial=0.0)) + room * resolution
+    worlds = world.posterior_worlds(config.n_worlds, config.risk_seed, reach=reach)
+    tables = np.array([worlds.rule(ids) for ids in rules], dtype=np.int64)
+    per_link = np.where(arrays.link_fixed, -1, tables[link_rules])
+    fields = tuple(world.certain_field(ids) for ids in rules)
+    baked = pack_world(world, fields, config.margin)
+    alone = dataclasses.replace(arrays, pairs=np.empty((0, 2), np.int64))
+    packed = pack_robot(alone, rules=link_rules)
+    _open_limits(packed.floats, packed.ints)
+    return Setting(
+        world=world,
+        robot=robot,
+        config=config,
+        worlds=worlds,
+        radii=radii,
+        tables=tables,
+        sphere_tables=per_link[arrays.sphere_link].astype(np.int64),
+        fields=fields,
+        packed=(baked.distance, baked.blocks, baked.floats),
+        floats=packed.floats,
+        ints=packed.ints,
+        spacing=min(resolution, 0.5 * float(world.map.kernel_length)),
+    )
+
+
+def _open_limits(rf: Float[np.ndarray, " f"], ri: Int[np.ndarray, " i"]) -> None:
+    """Let every joint value pass the limits of a packed robot."""
+    start, dof = int(ri[19]), int(ri[4])
+    rf[start : start + 2 * dof : 2] = -np.inf
+    rf[start + 1 : start + 2 * dof : 2] = np.inf
