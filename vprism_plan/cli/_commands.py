@@ -105,9 +105,11 @@ class Plan:
 
 @dataclass(frozen=True)
 class Query:
-    """Ask whether one configuration is free, with what clearance, and why not.
+    """Ask whether one configuration is free, and why not: margins, risk, entropy.
 
-    Exit code 0: free; 1: refused.
+    The table names the nearest pairs of a link and an obstacle: clearance (mm, a lower
+    bound), the map's P(occupied) and entropy (nats) at the obstacle's nearest point, and
+    the joint that changes the clearance most (mm per rad or m). Exit code 0: free; 1: refused.
     """
 
     map: Positional[Path]
@@ -123,6 +125,12 @@ class Query:
     """Turn of the root link about world z (rad); default: facing the objects."""
     margin: float = 0.0
     """Clearance that is required (m)."""
+    max_risk: Annotated[float | None, arg(metavar="P")] = None
+    """Bound on the probability of touching anything (0 to 1), as for `plan`."""
+    allow: Annotated[tuple[str, ...], arg(metavar="LINK:ID ...")] = ()
+    """Contacts to allow: a link or group of the robot and the id of an object, as hand:3."""
+    rows: int = 10
+    """Length of the table of margins; 0 for all. JSON has them all."""
     occluded: Literal["occupied", "posterior", "free"] = "occupied"
     """What space behind visible surfaces counts as."""
     unobserved: Literal["free", "occupied"] = "free"

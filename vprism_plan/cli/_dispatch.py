@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a parsed command to the code that runs it, loaded only then."""
 
-from vprism_plan.cli._commands import Command, Demo, Map, Mesh, Plan
+from vprism_plan.cli._commands import Command, Demo, Map, Mesh, Query
 from vprism_plan.cli._console import Console
 
 
@@ -14,12 +14,14 @@ def run(command: Command) -> int:
         if isinstance(command, Map):
             return _maps.run_map(command, console)
         return _maps.run_mesh(command, console)
-    from vprism_plan.cli import _motions
+    if isinstance(command, Query):
+        from vprism_plan.cli._query import run_query
 
+        return run_query(command, console)
     if isinstance(command, Demo):
         from vprism_plan.demo import run_demo
 
         return run_demo(command.output, command.seed, console)
-    if isinstance(command, Plan):
-        return _motions.run_plan(command, console)
-    return _motions.run_query(command, console)
+    from vprism_plan.cli._motions import run_plan
+
+    return run_plan(command, console)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Commands about a robot in a map: `plan` and `query`."""
+"""The command `plan`, and what `query` shares with it: world, base, what is asked for."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,12 +36,12 @@ def run_plan(command: Plan, console: Console) -> int:
 
     robot = Robot.from_urdf(command.robot)  # before the long work: the file may be wrong
     _check_lengths(command, robot)
-    checks = _checks(command, robot)
+    config = checks(command, robot)
     m = _map_from(command.input, command.frame, command.seed, console)
-    world = _bake(m, command, console)
+    world = bake(m, command, console)
     try:
         with console.stage("place"):
-            situation = _place(command, robot, world, checks)
+            situation = _place(command, robot, world, config)
     except NoPlaceError as error:
         console.finish(
             {
@@ -86,41 +86,6 @@ def solve(
     return report_plan(situation, result, output, console)
 
 
-def run_query(command: Query, console: Console) -> int:
-    """Answer for one configuration; exit code 0 if it is free, else 1."""
-    from vprism_plan.mapping import load_map
-    from vprism_plan.robots import Robot
-
-    robot = Robot.from_urdf(command.robot)
-    q = robot.check_configuration(command.q)
-    with console.stage("load"):
-        m = load_map(command.map)
-    world = _bake(m, command, console)
-    robot = _standing(command, robot, world, Surroundings.of(m))
-    with console.stage("check"):  # compiles on first use
-        checker = _checker(world, robot, command.margin)
-        report = checker.explain(q)
-    base = robot.base_pose
-    payload = {
-        **report.to_dict(),
-        "text": report.text(),
-        "base_pose": base,
-        "timings": console.timings,
-        "compile_seconds": console.compile_seconds,
-    }
-    verdict = "free" if report.valid else "refused"
-    lines = [
-        f"{verdict}: clearance {1000 * report.clearance:.1f} mm (required "
-        f"{1000 * report.margin:.1f} mm), self-clearance {1000 * report.self_clearance:.1f} mm",
-        *(f"  {contact.text()}" for contact in report.contacts),
-        "volume not seen: "
-        + (", ".join(f"{k} {100 * v:.0f} %" for k, v in report.shares.items()) or "none"),
-        f"base at {np.round(base[:3, 3], 3).tolist()} m",
-    ]
-    console.finish(payload, lines)
-    return 0 if report.valid else 1
-
-
 def _map_from(path: Path, frame: int | None, seed: int, console: Console) -> "VPrismMap":
     if path.suffix != ".safetensors":
         return fit(observe(path, frame, seed, console), seed, console)
@@ -130,7 +95,8 @@ def _map_from(path: Path, frame: int | None, seed: int, console: Console) -> "VP
         return load_map(path)
 
 
-def _bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
+def bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
+    """Return the world with the policies that were asked for."""
     from vprism_plan.world import World, WorldConfig
 
     config = WorldConfig(occluded=command.occluded, unobserved=command.unobserved)
@@ -138,13 +104,7 @@ def _bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
         return World(m, config)
 
 
-def _checker(world: "World", robot: "Robot", margin: float) -> "CollisionChecker":
-    from vprism_plan.collision import CheckerConfig, CollisionChecker
-
-    return CollisionChecker(world, robot, CheckerConfig(margin=margin))
-
-
-def _checks(command: Plan, robot: "Robot") -> "CheckerConfig":
+def checks(command: Plan | Query, robot: "Robot") -> "CheckerConfig":
     """Return what the checker is asked for; refuses bad values before the long work.
 
     Raises:
@@ -198,7 +158,7 @@ def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
     return matrix
 
 
-def _standing(
+def standing(
     command: Plan | Query, robot: "Robot", world: "World", around: Surroundings
 ) -> "Robot":
     """Return the robot on the base that was given, else on the first free place."""
@@ -211,7 +171,7 @@ def _standing(
     raise PlanningError("no free place for the base beside the objects; give --base-xyz")
 
 
-def _place(command: Plan, robot: "Robot", world: "World", checks: "CheckerConfig") -> Situation:
+def _place(command: Plan, robot: "Robot", world: "World", config: "CheckerConfig") -> Situation:
     """Return robot, checker, start and goal; what is open is chosen so that it is valid.
 
     Raises:
@@ -231,7 +191,7 @@ def _place(command: Plan, robot: "Robot", world: "World", checks: "CheckerConfig
         placed = robot.with_base_pose(pose)
         if command.base_xyz is None and not stands_free(placed, world):
             continue
-        checker = CollisionChecker(world, placed, checks)
+        checker = CollisionChecker(world, placed, config)
         rng = np.random.default_rng([command.seed, number])
         ends = choose_ends(
             checker,
