@@ -11,15 +11,19 @@ def draw_logits(map_, points, n_worlds, seed):
     phi = np.exp(-map_.config.gamma * away)
     phi[away > map_.space.radius**2] = 0.0
     features = np.column_stack([phi, np.ones(len(points))])
-    return np.einsum("nm,smk->nsk", features, weights)
+    return np.tensordot(features, weights, axes=(1, 1))
+
+
+def owners_of(logits):
+    """Logits (n, S, K) -> (n, S): 0 where softmax(z)_0 >= 1/2, else the likeliest object class."""
+    p = np.exp(logits - logits.max(axis=2, keepdims=True))
+    p /= p.sum(axis=2, keepdims=True)
+    return np.where(1.0 - p[:, :, 0] > 0.5, 1 + logits[:, :, 1:].argmax(axis=2), 0)
 
 
 def draw_owners(map_, points, n_worlds, seed):
-    """(n, S): 0 where softmax(z)_0 >= 1/2, else the likeliest object class."""
-    z = draw_logits(map_, points, n_worlds, seed)
-    p = np.exp(z - z.max(axis=2, keepdims=True))
-    p /= p.sum(axis=2, keepdims=True)
-    return np.where(1.0 - p[:, :, 0] > 0.5, 1 + z[:, :, 1:].argmax(axis=2), 0)
+    """(n, S): what each draw says of each point."""
+    return owners_of(draw_logits(map_, points, n_worlds, seed))
 
 
 def voxels_near(center, radius, resolution):

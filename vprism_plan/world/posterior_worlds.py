@@ -40,7 +40,8 @@ class PosteriorWorlds:
 
     Per voxel and draw one byte holds the distance to the nearest occupied voxel centre,
     rounded down: any ball is one comparison of S bytes, whatever its radius, and errs
-    only to "touches": by less than 0.9 voxels plus 1 / 16 (at most 1 / 8) of a voxel.
+    only to "touches": by twice the way from its centre to the nearest voxel's, so by less
+    than 1.74 voxels, and by 1 / 16 (at most 1 / 8) of a voxel.
 
     Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when
     the first ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the
