@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent
-ORDER = ("checking", "ompl_callbacks", "bake", "predict", "fit", "risk")
+ORDER = ("checking", "ompl_callbacks", "bake", "predict", "fit", "risk", "mesh_checker")
 
 
 def main() -> None:

@@ -144,7 +144,7 @@ def test_margin_to_a_plane(ball_robot):
 def test_voxel_inflation(blob, ball_robot, edge_of_blob):
     robot = ball_robot(0.02)
     checker, meshes = vp.CollisionChecker(blob, robot), vp.MeshChecker(blob, robot)
-    directions = np.random.default_rng(0).normal(size=(200, 3))
+    directions = np.random.default_rng(0).normal(size=(60, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     Q = directions * (edge_of_blob + 0.02 + 0.002)
     comparison = compare(checker, meshes, Q)
@@ -172,8 +172,8 @@ def test_background_and_thin_parts(seen, ball_robot):
     points, _ = scene.observation.points()
     _, bar, clutter = scene.solids
     on_clutter = points[(np.abs(clutter.signed_distance(points)) < 1e-3) & (points[:, 2] > 0.04)]
-    comparison = compare(checker, meshes, on_clutter[::40])
-    assert comparison.counts() == {"background": len(on_clutter[::40])}
+    comparison = compare(checker, meshes, on_clutter[::120])
+    assert comparison.counts() == {"background": len(on_clutter[::120])}
     on_bar = points[(np.abs(bar.signed_distance(points)) < 1e-3) & (points[:, 1] > 0.12)]
     missed = on_bar[map_.occupancy(on_bar) < 0.2][::20]
     comparison = compare(checker, meshes, missed)
@@ -348,18 +348,18 @@ def at_the_surface(meshes, radius, rng, n):
 @pytest.mark.parametrize("seed", range(3))
 def test_spheres_that_touch_a_mesh_are_never_free_for_the_field(seed, ball_robot):
     """At the surface, in every hollow, at the nodes where the field is tightest."""
-    map_ = random_map(seed, objects=1 + seed)
+    map_ = random_map(seed, objects=1 + seed % 2)
     world = bounded(map_, level=[0.5, 0.3, 0.7][seed])
     rng = np.random.default_rng(seed)
     for radius in (0.0015, 0.02):
         robot = ball_robot(radius)
         checker = vp.CollisionChecker(world, robot)
         meshes = vp.MeshChecker(world, robot)
-        Q = at_the_surface(meshes, radius, rng, 120)
-        comparison = compare(checker, meshes, Q)
-        assert comparison.both_refused > 50
-        assert not comparison.mesh_refuses
-        assert set(comparison.counts()) <= {"voxel inflation"}
+        Q = at_the_surface(meshes, radius, rng, 150)
+        touching = ~np.array([meshes.is_valid(q) for q in Q])
+        assert touching.sum() > 60
+        assert not np.any(checker.is_valid_batch(Q) & touching)
+        assert set(compare(checker, meshes, Q[::20]).counts()) <= {"voxel inflation"}
 
 
 def test_a_panda_in_the_demo_scene(demo_world, repository):
@@ -373,13 +373,14 @@ def test_a_panda_in_the_demo_scene(demo_world, repository):
     rng = np.random.default_rng(0)
     Q = rng.uniform(robot.lower, robot.upper, (30_000, robot.dof))
     Q = Q[checker.self_clearance_batch(Q) > 0]
-    near = Q[np.argsort(np.abs(checker.clearance_batch(Q)))[:150]]
+    clearance = checker.clearance_batch(Q)
+    near = Q[[*np.argsort(np.abs(clearance))[:80], *np.argsort(np.abs(clearance + 0.02))[:40]]]
     solids = vp.MeshChecker(world, robot)
     spheres = vp.MeshChecker(world, robot, links="spheres")
-    spheres.surfaces, spheres._queries.surfaces = solids.surfaces, solids.surfaces
     for meshes in (solids, spheres):
-        comparison = compare(checker, meshes, near)
-        assert not comparison.mesh_refuses
-        assert "unexplained" not in comparison.counts()
-    accepted_by_solids = compare(checker, solids, near).field_refuses
-    assert "conservative spheres" in {c.kind for d in accepted_by_solids for c in d.causes}
+        touching = ~np.array([meshes.is_valid(q) for q in near])
+        assert touching.sum() > 10
+        assert not np.any(checker.is_valid_batch(near) & touching)
+    causes = {c.kind for d in compare(checker, solids, near[:60]).disagreements for c in d.causes}
+    assert "conservative spheres" in causes
+    assert "unexplained" not in causes

@@ -146,7 +146,7 @@ class Truth:
                     best = min(best, -DENSE)
             outer = outline_of(T, solid)
             for plane in self.world.planes:
-                best = min(best, (outer @ plane[:3] - plane[3]).min())
+                best = min(best, (outer @ plane[:3] - plane[3]).min() - solid.padding)
         return best
 
     def _inside(self, name, center):
@@ -207,18 +207,22 @@ def self_free(robot, q):
     )
 
 
-def test_verdicts_and_distances_are_those_of_the_formulas(checker, flyer):
+@pytest.mark.parametrize("padding", [0.0, 0.015])
+def test_verdicts_and_distances_are_those_of_the_formulas(world, flyer, padding):
+    """Padded solids are grown all around: what comes nearer than the padding touches."""
+    flyer = flyer.with_padding(padding) if padding else flyer
+    checker = make(world, flyer)
     truth = Truth.of(checker)
     rng = np.random.default_rng(0)
     hits = misses = 0
-    for q in near_things(rng, 110):
+    for q in near_things(rng, 80):
         gap, distance = truth.gap(q), checker.distance(q)
         if abs(gap) < 2 * DENSE:
             continue
         if gap < 0:
             assert not checker.is_valid(q)
             assert distance <= 0.0
-            assert checker.contacts(q)
+            assert max(contact.depth for contact in checker.contacts(q)) > 0.0
             hits += 1
         else:
             if min(gap, distance) < REACH:
@@ -227,8 +231,8 @@ def test_verdicts_and_distances_are_those_of_the_formulas(checker, flyer):
                 assert checker.is_valid(q)
                 assert checker.contacts(q) == ()
                 misses += 1
-    assert hits > 25
-    assert misses > 8
+    assert hits > 15
+    assert misses > 5
 
 
 @pytest.mark.parametrize("links", ["geometry", "spheres"])
@@ -236,7 +240,7 @@ def test_the_three_answers_agree_with_one_another(world, flyer, links):
     checker = make(world, flyer, links=links, allowed_contacts={"hand": {1}})
     rng = np.random.default_rng(1)
     names = {*world.plane_names, *world.sources, *flyer.link_names}
-    for q in near_things(rng, 200):
+    for q in near_things(rng, 90):
         contacts = checker.contacts(q)
         assert checker.is_valid(q) == (not contacts)
         of_world = [c for c in contacts if c.kind not in {"self", "joint_limit"}]
@@ -389,7 +393,7 @@ def test_contact_rules_name_links_groups_and_objects(world, flyer):
     assert not ruled.allows("arm", "object:2")
     assert not ruled.allows("arm", "known:crate")
     seen = set()
-    for q in near_things(np.random.default_rng(6), 300):
+    for q in near_things(np.random.default_rng(6), 150):
         before = {(c.link, c.body) for c in free.contacts(q)}
         after = {(c.link, c.body) for c in ruled.contacts(q)}
         assert after == before - {("arm", "object:1"), ("body", "object:2")}
@@ -415,14 +419,14 @@ def test_a_link_mesh_of_a_box_answers_as_the_box(world, flyer):
     plain = make(world, flyer)
     assert sum(solid.shape.hollow for solid in meshed.solids) == 2
     same = 0
-    for q in near_things(np.random.default_rng(7), 150):
+    for q in near_things(np.random.default_rng(7), 100):
         a, b = plain.distance(q), meshed.distance(q)
         if abs(a) > 1e-3 or abs(b) > 1e-3:
             assert (a > 0) == (b > 0)
             if a > 0:
                 assert a == pytest.approx(b, abs=5e-4)
             same += 1
-    assert same > 50
+    assert same > 30
 
 
 def outline_mesh(solid):
@@ -488,9 +492,9 @@ def test_no_point_moves_more_than_the_step_between_two_configurations(checker, f
 
 def test_motions_and_paths_are_judged_by_their_configurations(checker):
     rng = np.random.default_rng(9)
-    Q = near_things(rng, 40)
-    free = [q for q in Q if checker.is_valid(q)][:6]
-    assert len(free) == 6
+    Q = near_things(rng, 30)
+    free = [q for q in Q if checker.is_valid(q)][:5]
+    assert len(free) == 5
     verdicts = []
     for qa, qb in itertools.pairwise(free):
         steps = [qa + t * (qb - qa) for t in checker._fractions(qa, qb, 0.02)]
@@ -566,3 +570,15 @@ def test_without_fcl_the_package_to_install_is_named(world, flyer, monkeypatch):
     monkeypatch.undo()
     _fcl.fcl.cache_clear()
     assert _fcl.fcl()
+
+
+def test_attached_objects_are_solids_like_any_other(world, flyer):
+    carrying = flyer.attach("cup", "arm", spheres=[(0.25, 0.0, 0.0, 0.03)], touch_links=("body",))
+    checker = make(world, carrying)
+    plain = make(world, flyer)
+    touched = set()
+    for q in near_things(np.random.default_rng(10), 80):
+        contacts = checker.contacts(q)
+        assert tuple(c for c in contacts if "cup" not in {c.link, c.body}) == plain.contacts(q)
+        touched |= {c.kind for c in contacts if c.link == "cup"}
+    assert {"object", "known", "support"} <= touched

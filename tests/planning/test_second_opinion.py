@@ -1,16 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What another judge says of a verified path is reported, and changes nothing else."""
 
+import json
 import logging
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from types import SimpleNamespace
 
 import disk_world
 import numpy as np
 import pytest
+from oracles.world_oracles import KernelMap
 
+from vprism_plan.collision import CollisionChecker, MeshChecker
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import plan
+from vprism_plan.robots import Robot
+from vprism_plan.world import World, WorldConfig
 
 START, GOAL = [-0.7, -0.5], [0.7, -0.5]
 
@@ -80,3 +85,58 @@ def test_what_is_no_judge_is_refused():
     checker = disk_world.wall_with_gap()
     with pytest.raises(Exception, match="second_opinion"):
         plan(checker, START, GOAL, second_opinion=42)
+
+
+# --- with meshes ------------------------------------------------------------------------
+
+CUBE = """<robot name="cube"><link name="world"/><link name="x"/><link name="cube"><collision>
+  <geometry><box size="0.06 0.06 0.06"/></geometry></collision></link>
+  <joint name="x" type="prismatic"><parent link="world"/><child link="x"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="y" type="prismatic"><parent link="x"/><child link="cube"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+
+
+@pytest.fixture(scope="module")
+def around_a_blob(tmp_path_factory):
+    """A function that makes a checker of a cube, in a sphere of a given radius, near a blob."""
+    path = tmp_path_factory.mktemp("cube") / "cube.urdf"
+    path.write_text(CUBE)
+    blob = KernelMap(np.zeros((1, 3)), np.array([[-6.0, 6.0]]), np.array([3.0, 0.0]))
+    world = World(blob, WorldConfig(bounds=((-0.3,) * 3, (0.3,) * 3)))
+
+    def make(radius):
+        spheres = {"cube": [{"center": [0.0, 0.0, 0.0], "radius": radius}]}
+        return CollisionChecker(world, Robot.from_urdf(path, spheres=spheres))
+
+    return make
+
+
+@pytest.mark.parametrize("y", [0.0, 0.05])
+def test_meshes_agree_with_paths_of_enclosing_spheres(around_a_blob, y):
+    checker = around_a_blob(0.053)
+    judge = MeshChecker.like(checker)
+    result = plan(checker, [-0.2, y], [0.2, y], second_opinion=judge)
+    assert result.solved, result.message
+    opinion = result.report.second_opinion
+    assert opinion.valid
+    assert opinion.configurations > 50
+    assert "disagrees" not in result.message
+
+
+def test_meshes_name_the_link_that_sticks_out_of_its_spheres(around_a_blob):
+    """The checker only knows a small ball; its cube scrapes the object on the way."""
+    checker = around_a_blob(0.01)
+    start, goal = [-0.2, 0.05], [0.2, 0.05]
+    result = plan(checker, start, goal, second_opinion=MeshChecker.like(checker))
+    assert result.solved
+    assert result.path is not None
+    (found,) = result.report.second_opinion.findings
+    assert found.edge == 0
+    assert found.contacts[0].link == "cube"
+    assert found.contacts[0].body == "object:1"
+    assert {cause.kind for cause in found.causes} == {"solids outside spheres"}
+    for word in ("MeshChecker disagrees", "edge 0", "cube", "object:1", "solids outside spheres"):
+        assert word in result.message
+    json.dumps(asdict(result.report))  # as the command line writes it
+    json.dumps(result.report.second_opinion.to_dict())

@@ -8,7 +8,7 @@ its figures for a sphere that overlaps a mesh (depth and distance are garbage th
 distance from the sphere's centre is exact instead), and its signed distance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -60,13 +60,29 @@ class Shape:
         kind: "sphere", "box", "cylinder" or "mesh".
         size: as for `PrimitiveGeometry`; unused for a mesh.
         mesh: `trimesh.Trimesh`, for a mesh.
+        padding: metres by which the shape is grown all around. A sphere takes it up in its
+            radius. FCL has no boxes and cylinders with round edges: they stay as they
+            are, and what comes nearer than the padding touches.
     """
 
-    def __init__(self, kind: str, size: tuple[float, ...] = (), mesh: Any = None) -> None:
+    def __init__(
+        self,
+        kind: str,
+        size: tuple[float, ...] = (),
+        mesh: Any = None,
+        padding: float = 0.0,
+    ) -> None:
         self.kind = kind
-        self.size = size
+        self.size = (size[0] + padding,) if kind == "sphere" else size
+        self.padding = 0.0 if kind == "sphere" else padding
         self.normals: np.ndarray | None = None
         self.body = fcl().CollisionObject(self._geometry(mesh))
+        # With sharp edges, so it holds the padded shape: for the place of a contact only.
+        self.hull: Any = None
+        if self.padding > 0.0:
+            factors = (2.0, 2.0, 2.0) if kind == "box" else (1.0, 2.0)
+            grown = (v + f * padding for v, f in zip(size, factors, strict=True))
+            self.hull = Shape(kind, tuple(grown))
         self._rotation = np.eye(3)
         self._center = np.zeros(3)
 
@@ -97,6 +113,8 @@ class Shape:
         self._rotation = R
         self._center = t
         self.body.setTransform(fcl().Transform(R, t))
+        if self.hull is not None:
+            self.hull.place(R, t)
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
@@ -122,13 +140,25 @@ def face_normals(
 
 def touches(a: Shape, b: Shape) -> bool:
     """Whether two shapes intersect; of a mesh, only its surface counts."""
+    if a.padding + b.padding > 0.0:
+        return gap(a, b) <= 0.0
+    return _cross(a, b)
+
+
+def _cross(a: Shape, b: Shape) -> bool:
+    """Whether two shapes without their padding intersect."""
     module = fcl()
     return bool(module.collide(a.body, b.body, module.CollisionRequest(), module.CollisionResult()))
 
 
 def gap(a: Shape, b: Shape) -> float:
     """Distance between two shapes, metres; 0.0 where they touch."""
-    if touches(a, b):  # FCL's distance is anything between -1 and garbage then
+    return max(0.0, _core_gap(a, b) - a.padding - b.padding)
+
+
+def _core_gap(a: Shape, b: Shape) -> float:
+    """Distance between two shapes without their padding, metres; 0.0 where they touch."""
+    if _cross(a, b):  # FCL's distance is anything between -1 and garbage then
         return 0.0
     module = fcl()
     request, result = module.DistanceRequest(), module.DistanceResult()
@@ -168,8 +198,17 @@ def deepest_touch(a: Shape, b: Shape) -> Touch | None:
     Between solids the depth is the way out; for a sphere and a mesh, how far the surface
     reaches into the sphere. For other shapes and a mesh it is FCL's figure for the deepest
     triangle, which is local: it says how far the solid reaches through one triangle, not
-    how far it has to move. A mesh's normal is the triangle's own.
+    how far it has to move. A mesh's normal is the triangle's own. Padding adds to depths.
     """
+    padding = a.padding + b.padding
+    if padding > 0.0:
+        between = _core_gap(a, b)
+        if between > padding:
+            return None
+        touch = deepest_touch(a.hull or a, b.hull or b)
+        if between > 0.0 and touch is not None:
+            touch = replace(touch, depth=padding - between)
+        return touch
     module = fcl()
     request = module.CollisionRequest(num_max_contacts=_MAX_CONTACTS, enable_contact=True)
     result = module.CollisionResult()

@@ -45,7 +45,10 @@ class Queries:
         self._allowed = allowed
         self._planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
         self._pairs = placed.pairs()
-        self._apart = placed.radii[self._pairs].sum(axis=1)
+        # The padding of collision spheres counts against the world only.
+        padding = placed.robot.arrays.link_padding[placed.links]
+        padding = padding * [solid.sphere >= 0 for solid in placed.solids]
+        self._apart = (placed.radii - padding)[self._pairs].sum(axis=1)
         # Pairs of solid and body that are never looked at: allowed, or of a fixed link.
         self._ignored = allowed[placed.links][:, surfaces.classes] | ~placed.moving[:, None]
 

@@ -87,7 +87,8 @@ def robot_solids(
             solids += _mesh_solids(index, name, meshes[name])
         elif links == "geometry" and name in robot.geometry and name not in partial:
             solids += [
-                _primitive(index, -1, s.kind, s.size, s.T_link) for s in robot.geometry[name]
+                _primitive(index, -1, s.kind, s.size, s.T_link, s.padding)
+                for s in robot.geometry[name]
             ]
         else:
             for sphere in np.flatnonzero(robot.sphere_links == index):
@@ -112,16 +113,25 @@ def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
 
 
 def _primitive(
-    link: int, sphere: int, kind: str, size: Sequence[float], T_link: Float[np.ndarray, "4 4"]
+    link: int,
+    sphere: int,
+    kind: str,
+    size: Sequence[float],
+    T_link: Float[np.ndarray, "4 4"],
+    padding: float = 0.0,
 ) -> Solid:
     size = tuple(float(v) for v in size)
-    radius = {
-        "sphere": lambda: size[0],
-        "box": lambda: 0.5 * float(np.linalg.norm(size)),
-        "cylinder": lambda: float(np.hypot(size[0], 0.5 * size[1])),
-    }[kind]()
+    radius = (
+        padding
+        + {
+            "sphere": lambda: size[0],
+            "box": lambda: 0.5 * float(np.linalg.norm(size)),
+            "cylinder": lambda: float(np.hypot(size[0], 0.5 * size[1])),
+        }[kind]()
+    )
+    shape = Shape(kind, size, padding=float(padding))
     center = np.array(T_link[:3, 3])
-    return Solid(link, sphere, Shape(kind, size), np.array(T_link), center, radius, center)
+    return Solid(link, sphere, shape, np.array(T_link), center, radius, center)
 
 
 def _mesh_solids(link: int, name: str, mesh: Any) -> list[Solid]:
@@ -159,13 +169,14 @@ class PlacedSolids:
         self._centers = np.array([solid.center for solid in solids]).reshape(-1, 3)
         self._witness = np.array([solid.witness for solid in solids]).reshape(-1, 3)
         self._levers = self._lever_table()
-        # Half edges of boxes, half lengths and radii of cylinders, radii of spheres: a
-        # primitive reaches as far in a direction as these say together.
+        # Half edges of boxes, half lengths and radii of cylinders, radii of spheres and
+        # paddings: a primitive reaches as far in a direction as these say together.
         self._halves = np.zeros((len(solids), 3))
         self._rims, self._balls = np.zeros(len(solids)), np.zeros(len(solids))
         self._meshes = np.flatnonzero([solid.vertices is not None for solid in solids])
         for i, solid in enumerate(solids):
             size = solid.shape.size
+            self._balls[i] = solid.shape.padding
             if solid.shape.kind == "box":
                 self._halves[i] = 0.5 * np.array(size)
             elif solid.shape.kind == "cylinder":

@@ -53,7 +53,7 @@ class MeshChecker:
             the collision spheres of links that have neither (or whose URDF also has
             meshes, which are not read). "spheres": the collision spheres of every link.
         link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres, in place of its
-            primitives.
+            primitives. They are taken as they are: the robot's padding does not grow them.
         allowed_contacts: link or SRDF group -> ids of the objects that it may touch.
         resolution: edge of the objects' marching cubes, metres. None: the lattice of the
             world's distance field (a quarter of its resolution), on which no mesh reaches
