@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A second opinion by FCL: the surfaces of a world against the solids of a robot.
 
-It shares with `CollisionChecker` the map, its level and the robot's description, and
-nothing else: not the distance field, not the octree, not the kernels.
+It judges the same map at the same level for the same robot, but with neither the distance
+field, nor the octree that it is traced with, nor the compiled kernels.
 """
 
 import math
