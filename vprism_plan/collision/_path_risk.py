@@ -46,7 +46,9 @@ class PathRisk:
         self._voxel, self._steps = worlds.first, worlds.scale
         lower, upper = clopper_pearson(config.n_worlds, config.confidence)
         self._lower = np.maximum(lower - worlds.error_occupied, 0.0)
-        self._upper = np.minimum(upper + worlds.error_free, 1.0)
+        # Where something may be touched, a voxel said to be its own may hide another object.
+        hidden = worlds.error_free + (worlds.error_occupied if any(rules) else 0.0)
+        self._upper = np.minimum(upper + hidden, 1.0)
         self._codes: SpaceCodes | None = None
         self._held_out: PathRisk | None = None
         self.allowed = 0

@@ -193,9 +193,9 @@ class CollisionChecker(Queries):
         if not valid and stats[0] >= 0.0:
             fraction = float(stats[0])
             state = self.explain(interpolate(self.robot, qa, qb, fraction))
-        elif not valid:
+        elif self._bounded is not None and not valid:
             edge = np.stack([qa, qb])
-            risk, fraction = self._risk().estimate(edge), self._risk().exceeded_at(edge)
+            risk, fraction = self._bounded.estimate(edge), self._bounded.exceeded_at(edge)
         return MotionReport(
             valid=valid,
             certified=valid and bool(stats[2] <= _ROUNDING),

@@ -38,7 +38,7 @@ class CheckerConfig:
     self_margin: float = 0.0
     min_motion: float = 0.002
     max_risk: float | None = None
-    allowed_contacts: Mapping[str, Any] = field(default_factory=dict)
+    allowed_contacts: Mapping[str, Any] = field(default_factory=dict, hash=False)
     n_worlds: int = 256
     risk_seed: int = 0
     confidence: float = 0.95
@@ -86,7 +86,9 @@ def _checked_contacts(contacts: Any) -> dict[str, frozenset[int]]:
     checked = {}
     for name, ids in contacts.items():
         whole = isinstance(ids, Collection) and not isinstance(ids, str)
-        if not (whole and all(isinstance(i, (int, np.integer)) for i in ids)):
+        if not (
+            whole and all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in ids)
+        ):
             raise ConfigError(
                 f"allowed_contacts[{name!r}] is {ids!r}; it must be a set of object ids (whole "
                 "numbers), for example {3}"
