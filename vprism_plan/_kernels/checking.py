@@ -12,6 +12,7 @@ robot floats `rf`, robot integers `ri`:
     ri[16:24] = offsets into rf of: frame floats (R 9, t 3, multiplier, offset), spheres
                 (all x, all y, all z, all radii), link bounding spheres (x, y, z,
                 radius), limits (lower, upper), reach table (n_frames, n_links), self margin
+                and, per pair, the padding of both links, which their gap does not count
 
 Frame 0 is the base; every other frame moves about or along its own z axis. A link's
 rule says which of the fields it is checked against; -1: none (it stands on the world).
@@ -303,7 +304,6 @@ def _place_pair(a, b, T, C, placed, rf, ri):
 @njit(cache=True, nogil=True, inline="always")
 def _self_clear(T, lc, C, placed, rf, ri):
     """Whether every pair of links keeps more than the self margin; bounding spheres first."""
-    margin = rf[ri[21]]
     bo = ri[18]
     ro = ri[17] + 3 * ri[1]
     for pair in range(ri[3]):
@@ -313,6 +313,7 @@ def _self_clear(T, lc, C, placed, rf, ri):
         y = lc[b, 1]
         z = lc[b, 2]
         d2 = (lc[a, 0] - x) ** 2 + (lc[a, 1] - y) ** 2 + (lc[a, 2] - z) ** 2
+        margin = rf[ri[21]] - rf[ri[21] + 1 + pair]
         ball = rf[bo + 4 * b + 3] + margin
         reach = rf[bo + 4 * a + 3] + ball
         if d2 > reach * reach:
@@ -346,7 +347,8 @@ def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
     y = lc[b, 1]
     z = lc[b, 2]
     d2 = (lc[a, 0] - x) ** 2 + (lc[a, 1] - y) ** 2 + (lc[a, 2] - z) ** 2
-    ball = rf[bo + 4 * b + 3]
+    padding = rf[ri[21] + 1 + pair]
+    ball = rf[bo + 4 * b + 3] - padding
     reach = rf[bo + 4 * a + 3] + ball
     if d2 > (reach + enough) ** 2:
         return np.sqrt(d2) - reach
@@ -367,7 +369,7 @@ def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
             continue
         for t in range(ri[lb + 1], ri[lb + 2]):
             d2 = (px - C[0, t]) ** 2 + (py - C[1, t]) ** 2 + (pz - C[2, t]) ** 2
-            best = min(best, np.sqrt(d2) - ra - rf[ro + t])
+            best = min(best, np.sqrt(d2) - ra - rf[ro + t] + padding)
     return best
 
 
@@ -462,8 +464,8 @@ def sphere_clearances(q, rf, ri, D, E, wf, C, plane, which, field):
 
 @njit(cache=True, nogil=True)
 def pair_gaps(q, rf, ri, gaps, spheres):
-    """Fill gaps (n_pairs,) with the smallest sphere gap of each link pair, metres, and
-    spheres (n_pairs, 2) with the two spheres that have it."""
+    """Fill gaps (n_pairs,) with the smallest sphere gap of each link pair (metres, padding
+    not counted), and spheres (n_pairs, 2) with the two spheres that have it."""
     C = np.empty((3, ri[1]))
     place_spheres(q, rf, ri, C)
     li = ri[9]
@@ -477,7 +479,7 @@ def pair_gaps(q, rf, ri, gaps, spheres):
                 d2 = 0.0
                 for k in range(3):
                     d2 += (C[k, s] - C[k, t]) ** 2
-                gap = np.sqrt(d2) - rf[ro + s] - rf[ro + t]
+                gap = np.sqrt(d2) - rf[ro + s] - rf[ro + t] + rf[ri[21] + 1 + pair]
                 if gap < gaps[pair]:
                     gaps[pair] = gap
                     spheres[pair, 0] = s

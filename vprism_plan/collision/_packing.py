@@ -174,7 +174,7 @@ def pack_robot(
         bounding,
         limits,
         reach_table(arrays),
-        np.array([self_margin]),
+        np.array([self_margin, *arrays.link_padding[arrays.pairs].sum(axis=1)]),
     ]
     frame_ints = np.column_stack([arrays.parent, arrays.kind, np.maximum(arrays.q_index, 0)])
     starts, ends = arrays.link_start[:-1], arrays.link_start[1:]

@@ -48,6 +48,8 @@ class KinematicArrays:
         link_center: Centre of a ball that holds all spheres of the link.
         link_radius: Radius of that ball.
         link_fixed: True where no joint moves the link.
+        link_padding: Metres of each link's radii that are padding. They count against the
+            world; a pair's gap is that of its spheres plus the padding of both links.
         pairs: Link pairs (first < second) to test for self-collision.
         lower: Lower joint limits; -pi for continuous joints.
         upper: Upper joint limits; +pi for continuous joints.
@@ -73,6 +75,7 @@ class KinematicArrays:
     link_center: Float[np.ndarray, "links 3"]
     link_radius: Float[np.ndarray, "links"]
     link_fixed: Bool[np.ndarray, "links"]
+    link_padding: Float[np.ndarray, "links"]
     pairs: Int[np.ndarray, "pairs 2"]
     lower: Float[np.ndarray, "dof"]
     upper: Float[np.ndarray, "dof"]

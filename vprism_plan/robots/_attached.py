@@ -143,6 +143,7 @@ def with_link(
         link_center=np.vstack([arrays.link_center, center]),
         link_radius=np.append(arrays.link_radius, radius),
         link_fixed=np.append(arrays.link_fixed, sits.frame == 0),
+        link_padding=np.append(arrays.link_padding, 0.0),
         pairs=np.ascontiguousarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]),
     )
 
@@ -166,6 +167,7 @@ def without_link(arrays: KinematicArrays, link: int) -> KinematicArrays:
         link_center=np.ascontiguousarray(np.delete(arrays.link_center, link, axis=0)),
         link_radius=np.delete(arrays.link_radius, link),
         link_fixed=np.delete(arrays.link_fixed, link),
+        link_padding=np.delete(arrays.link_padding, link),
         pairs=np.ascontiguousarray(pairs - (pairs > link)),
     )
 

@@ -136,6 +136,7 @@ def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dic
         "link_center": _floats([ball[0] for ball in bounds]),
         "link_radius": _floats([ball[1] for ball in bounds]),
         "link_fixed": link_frame == 0,
+        "link_padding": np.zeros(len(link_frame)),
     }
 
 

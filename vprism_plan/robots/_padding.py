@@ -41,7 +41,7 @@ def padded(
     before = touching_pairs(robot.arrays, robot.neutral, names)
     touching = touching_pairs(arrays, robot.neutral, names) - before
     if touching:
-        _logger.warning("padding makes links touch in the neutral state: %s", sorted(touching))
+        _logger.warning("the scale makes links touch in the neutral state: %s", sorted(touching))
     return dataclasses.replace(
         robot, arrays=arrays, geometry=geometry, _torch=TorchKinematics(arrays)
     )
@@ -97,6 +97,9 @@ def grown(
 ) -> KinematicArrays:
     """Scale the spheres of each link about the centre of its bounding ball, then pad them.
 
+    What was padding before is scaled like the rest and stays padding, in self-collision up
+    to its old size: the rest of what a scale above 1 makes of it counts as the link's.
+
     A scale above 1 gives each sphere the smallest ball that holds it and its scaled image:
     a link with an elbow does not hold itself when it is only blown up from its middle.
     """
@@ -118,6 +121,7 @@ def grown(
         sphere_radius=radii,
         link_center=np.array([ball[0] for ball in balls]),
         link_radius=np.array([ball[1] for ball in balls]),
+        link_padding=np.minimum(scale, 1.0) * arrays.link_padding + padding,
     )
 
 

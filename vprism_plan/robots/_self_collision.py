@@ -58,7 +58,8 @@ def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
 def pairs_touching(
     arrays: KinematicArrays, q: Float[np.ndarray, "n dof"], pairs: Int[np.ndarray, "pairs 2"]
 ) -> Bool[np.ndarray, "n pairs"]:
-    """For each configuration and link pair, whether any of their spheres overlap."""
+    """For each configuration and link pair, whether any of their spheres overlap, padding
+    not counted."""
     centers = place_spheres(arrays, q)
     touching = np.zeros((len(q), len(pairs)), dtype=bool)
     for k, (a, b) in enumerate(pairs):
@@ -66,6 +67,7 @@ def pairs_touching(
         of_b = slice(arrays.link_start[b], arrays.link_start[b + 1])
         gap = np.linalg.norm(centers[:, of_a, None] - centers[:, None, of_b], axis=-1)
         reach = arrays.sphere_radius[of_a, None] + arrays.sphere_radius[None, of_b]
+        reach -= arrays.link_padding[a] + arrays.link_padding[b]
         touching[:, k] = (gap < reach).any(axis=(1, 2))
     return touching
 

@@ -326,10 +326,11 @@ class Robot:
         and multiplies their size; above 1, spheres are widened so that they also hold what
         they held before. Scaled and padded spheres hold the scaled and padded solids.
 
-        MoveIt differs in three ways: it scales every shape about the shape's own origin;
-        its padding moves each face of a box outward, corners farther, where ours is a
-        distance in every direction; and it leaves self-collision unpadded, where ours
-        counts in self-collision too (pairs that now touch at ``neutral`` are logged).
+        As in MoveIt, padding counts against the world only: links may come as near to each
+        other as before. MoveIt differs in three ways: it scales every shape about the
+        shape's own origin; its padding moves each face of a box outward, corners farther,
+        where ours is a distance in every direction; and it leaves the scale out of
+        self-collision, where ours counts (pairs that then touch at ``neutral`` are logged).
 
         Args:
             padding: Metres, 0 or more: one number, or a table by link or group whose other
