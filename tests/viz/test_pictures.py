@@ -136,7 +136,7 @@ def test_plan_picture_shows_start_goal_hand_and_objects(demo_map, repository):
 
     assert hue(plan_plot.START_COLOR) > 5000
     assert hue(plan_plot.GOAL_COLOR) > 5000
-    assert hue(plan_plot._HAND_COLOR) > 500
+    assert hue(plan_plot.HAND_COLOR) > 500
     for object_id in meshes:
         assert hue(object_color(object_id)) > 200
     centers = sphere_centers(robot, np.stack([start, goal]))

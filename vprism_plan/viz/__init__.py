@@ -3,15 +3,19 @@
 
 from vprism_plan.viz._figures import object_color, save_figure
 from vprism_plan.viz.map_plot import map_figure
+from vprism_plan.viz.margin_plot import margin_figure
 from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample, sphere_centers
+from vprism_plan.viz.risk_plot import risk_figure
 from vprism_plan.viz.scene_plot import scene_figure
 
 __all__ = [
     "hand_path",
     "map_figure",
+    "margin_figure",
     "object_color",
     "plan_figure",
     "resample",
+    "risk_figure",
     "save_figure",
     "scene_figure",
     "sphere_centers",

@@ -24,7 +24,7 @@ _OCCLUDED = 0.01  # metres behind the measured depth
 
 
 @dataclass(frozen=True)
-class _Slice:
+class Slice:
     """A plane through the world: origin + a * u + b * v for a, b in the given ranges."""
 
     title: str
@@ -38,13 +38,16 @@ class _Slice:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
+        """First and last a, first and last b, as matplotlib wants them."""
         return float(self.a[0]), float(self.a[-1]), float(self.b[0]), float(self.b[-1])
 
     def points(self) -> np.ndarray:
+        """World points (len(b) * len(a), 3), metres."""
         a, b = np.meshgrid(self.a, self.b)
         return self.origin + a.reshape(-1, 1) * self.u + b.reshape(-1, 1) * self.v
 
     def image(self, values: np.ndarray) -> np.ndarray:
+        """Values at `points` as rows of b and columns of a."""
         return np.asarray(values).reshape(len(self.b), len(self.a))
 
     def locate(self, points: np.ndarray) -> np.ndarray:
@@ -80,7 +83,7 @@ def map_figure(
         figure.suptitle(title)
     for row, plane in enumerate(slices):
         points = plane.points()
-        hidden = plane.image(_occluded(m.views, points)).astype(float)
+        hidden = plane.image(occluded(m.views, points)).astype(float)
         support = plane.image(m.support(points))
         occupancy = plane.image(m.occupancy(points))
         panels = (
@@ -101,12 +104,12 @@ def map_figure(
             axis.set_title(f"{name}, {plane.title}", fontsize=10)
             axis.set_xlabel(plane.a_label)
             axis.set_ylabel(plane.b_label)
-            _overlay(axis, plane, m, hidden, support, occupancy, truth)
+            overlay(axis, plane, m, hidden, support, occupancy, truth)
     _legend(figure, truth is not None)
     return figure
 
 
-def _slices(m: "VPrismMap", resolution: float) -> tuple[_Slice, _Slice]:
+def _slices(m: "VPrismMap", resolution: float) -> tuple[Slice, Slice]:
     """Both slices share their first axis, the direction in which the camera looks."""
     seen = [view.points() for view in m.views]
     objects = np.concatenate([points[labels > 0] for points, labels in seen])
@@ -129,7 +132,7 @@ def _slices(m: "VPrismMap", resolution: float) -> tuple[_Slice, _Slice]:
     # What hides behind the objects is the point of the picture: room for it.
     along = np.arange(-reach, reach + 0.10, resolution)
     height = table + 0.5 * (top - table)
-    horizontal = _Slice(
+    horizontal = Slice(
         title=f"{100 * (height - table):.0f} cm above the table, seen from above",
         origin=middle + np.array([0.0, 0.0, height]),
         u=sight,
@@ -139,7 +142,7 @@ def _slices(m: "VPrismMap", resolution: float) -> tuple[_Slice, _Slice]:
         a_label="",
         b_label="to the camera's left (m)",
     )
-    vertical = _Slice(
+    vertical = Slice(
         title="upright, through the middle of the objects",
         origin=middle,
         u=sight,
@@ -152,7 +155,7 @@ def _slices(m: "VPrismMap", resolution: float) -> tuple[_Slice, _Slice]:
     return horizontal, vertical
 
 
-def _occluded(views: tuple[Observation, ...], points: np.ndarray) -> np.ndarray:
+def occluded(views: tuple[Observation, ...], points: np.ndarray) -> np.ndarray:
     """Return where no view saw the point and at least one saw something in front of it."""
     behind = np.zeros(len(points), dtype=bool)
     seen = np.zeros(len(points), dtype=bool)
@@ -169,9 +172,9 @@ def _occluded(views: tuple[Observation, ...], points: np.ndarray) -> np.ndarray:
     return behind & ~seen
 
 
-def _overlay(
+def overlay(
     axis: Axes,
-    plane: _Slice,
+    plane: Slice,
     m: "VPrismMap",
     hidden: np.ndarray,
     support: np.ndarray,

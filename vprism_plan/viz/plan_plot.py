@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 START_COLOR = (0.16, 0.44, 0.70)
 GOAL_COLOR = (0.85, 0.45, 0.13)
-_HAND_COLOR = (0.72, 0.05, 0.35)
+HAND_COLOR = (0.72, 0.05, 0.35)
 _BASE_COLOR = (0.66, 0.66, 0.68)
 _PIXELS = 1120  # along the longer side of a view, before averaging
 _CLEAR = 0.16  # how much of a pose in between is seen
@@ -135,7 +135,7 @@ def _render(stage: _Stage, view: View) -> np.ndarray:
         _lay_over(picture, ghost, behind, np.where(ghost.edges(), 2.5 * _CLEAR, _CLEAR))
     hand = Layer(film)
     beads = _beads(stage.hand, 0.004)
-    hand.add_spheres(beads, np.full(len(beads), 0.008), _HAND_COLOR)
+    hand.add_spheres(beads, np.full(len(beads), 0.008), HAND_COLOR)
     _lay_over(picture, hand, behind, np.where(hand.depth < behind, 1.0, 0.35), hidden_too=True)
     return np.clip(halved(picture), 0.0, 1.0)
 
@@ -221,7 +221,7 @@ def _legend(figure: Figure, meshes: "Mapping[int, trimesh.Trimesh]") -> None:
     entries: list[Patch | Line2D] = [
         Patch(color=START_COLOR, label="start"),
         Patch(color=GOAL_COLOR, label="goal"),
-        Line2D([], [], color=_HAND_COLOR, linewidth=3, label="path of the hand"),
+        Line2D([], [], color=HAND_COLOR, linewidth=3, label="path of the hand"),
     ]
     entries += [Patch(color=tuple(object_color(k)), label=f"object {k}") for k in sorted(meshes)]
     figure.legend(
