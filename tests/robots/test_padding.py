@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Padding and scale: by how much links grow, and that spheres still hold the solids."""
 
+import dataclasses
 import logging
 
 import numpy as np
@@ -11,10 +12,13 @@ from hypothesis import strategies as st
 from oracles.kinematics_oracle import random_pose
 from test_sphere_enclosure import gap, interior, spheres_of, surface
 
-from vprism_plan.collision import CollisionChecker
+from vprism_plan._kernels import checking
+from vprism_plan.collision import CollisionChecker, MeshChecker
 from vprism_plan.collision._packing import pack_robot
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
+from vprism_plan.robots._padding import grown
+from vprism_plan.robots._self_collision import pairs_touching
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -161,14 +165,85 @@ def test_clearance_falls_by_exactly_the_padding(demo_world, ball_robot):
     np.testing.assert_allclose(padded, bare - 0.017, atol=1e-9)
 
 
-def test_links_that_padding_makes_touch_are_named(robots, caplog):
+def test_padding_leaves_self_collision_as_it_was(demo_world, robots):
+    """As in MoveIt: links may come as near to each other as without it."""
+    panda = robots["panda"].attach("rod", "panda_hand", spheres=[(0, 0, 0.3, 0.02)])
+    padded = panda.with_padding({"hand": 0.02, "panda_link2": 0.03, "rod": 0.04})
+    bare, wide = (CollisionChecker(demo_world, robot) for robot in (panda, padded))
+    Q = np.random.default_rng(0).uniform(panda.lower, panda.upper, (400, 7))
+    np.testing.assert_allclose(
+        wide.self_clearance_batch(Q), bare.self_clearance_batch(Q), atol=1e-9
+    )
+    touching = pairs_touching(panda.arrays, Q, panda.collision_pairs)
+    np.testing.assert_array_equal(
+        pairs_touching(padded.arrays, Q, padded.collision_pairs), touching
+    )
+    assert 50 < touching.any(axis=1).sum() < 350
+    for q in Q[:40]:
+        np.testing.assert_allclose(wide.pair_gaps(q)[0], bare.pair_gaps(q)[0], atol=1e-9)
+    valid = bare.self_clearance_batch(Q) > 0.0
+    np.testing.assert_array_equal(wide.is_valid_batch(Q), valid & (wide.clearance_batch(Q) > 0.0))
+    scaled = padded.with_padding(scale=1.5)
+    assert CollisionChecker(demo_world, scaled).self_clearance_batch(Q).max() < (
+        bare.self_clearance_batch(Q).max()
+    )
+
+
+def test_the_second_opinion_pads_links_against_the_world_alone(demo_world, robots):
+    """Whatever the field accepts of a padded robot, FCL does, with spheres and with solids."""
+    pose = np.eye(4)
+    pose[:3, 3] = (0.0, -0.7, 0.0)
+    padded = robots["panda"].with_base_pose(pose).with_padding({"hand": 0.02, "panda_link5": 0.03})
+    checker = CollisionChecker(demo_world, padded)
+    Q = np.random.default_rng(0).uniform(padded.lower, padded.upper, (3000, 7))
+    accepted = Q[checker.is_valid_batch(Q)][:40]
+    assert len(accepted) == 40
+    unpadded = pairs_touching(
+        dataclasses.replace(padded.arrays, link_padding=np.zeros(len(padded.link_names))),
+        accepted,
+        padded.collision_pairs,
+    )
+    assert unpadded.any()  # their padded spheres do overlap
+    for links in ("spheres", "geometry"):
+        meshes = MeshChecker(demo_world, padded, links=links)
+        assert all(meshes.is_valid(q) for q in accepted)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_padded_pairs_equal_the_slow_oracle(seed):
+    """Any tree, any padding: the kernels against sphere pairs one by one."""
+    from oracles import checker_oracle
+    from oracles.random_robots import random_arrays, random_q
+
+    rng = np.random.default_rng(seed)
+    arrays = random_arrays(rng)
+    links = len(arrays.link_frame)
+    padded = grown(arrays, np.ones(links), rng.uniform(0, 0.05, links))
+    packed, plain = pack_robot(padded), pack_robot(arrays)
+    for _ in range(20):
+        q = random_q(rng, arrays)
+        gaps, spheres = (
+            np.empty(len(arrays.pairs)),
+            np.zeros((len(arrays.pairs), 2), dtype=np.int64),
+        )
+        checking.pair_gaps(q, packed.floats, packed.ints, gaps, spheres)
+        assert gaps.min(initial=np.inf) == pytest.approx(
+            checker_oracle.self_clearance(arrays, q), abs=1e-12
+        )
+        again = gaps.copy()
+        checking.pair_gaps(q, plain.floats, plain.ints, again, spheres)
+        np.testing.assert_allclose(gaps, again, atol=1e-12)
+
+
+def test_links_that_a_scale_makes_touch_are_named(robots, caplog):
+    panda = robots["panda"]
     with caplog.at_level(logging.WARNING):
-        robots["panda"].with_padding(0.005)
+        panda.with_padding(0.1)
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
-        padded = robots["panda"].with_padding(0.1)
-    assert "padding makes links touch" in caplog.text
-    assert len(padded.collision_pairs) == len(robots["panda"].collision_pairs)
+        scaled = panda.with_padding(scale={"panda_link5": 1.2})
+    assert "makes links touch in the neutral state: [('panda_link5', 'panda_link7')]" in caplog.text
+    assert len(scaled.collision_pairs) == len(panda.collision_pairs)
 
 
 def test_links_without_spheres_keep_their_solids(write):

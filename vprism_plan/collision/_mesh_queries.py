@@ -45,9 +45,7 @@ class Queries:
         self._allowed = allowed
         self._planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
         self._pairs = placed.pairs()
-        # The padding of collision spheres counts against the world only.
-        padding = placed.robot.arrays.link_padding[placed.links]
-        padding = padding * [solid.sphere >= 0 for solid in placed.solids]
+        padding = np.array([solid.padding for solid in placed.solids])
         self._apart = (placed.radii - padding)[self._pairs].sum(axis=1)
         # Pairs of solid and body that are never looked at: allowed, or of a fixed link.
         self._ignored = allowed[placed.links][:, surfaces.classes] | ~placed.moving[:, None]
@@ -170,14 +168,14 @@ class Queries:
 
     def _collide(self, i: int, j: int) -> bool:
         """Whether two solids of the robot touch."""
-        if _fcl.touches(self.placed.shape(i), self.placed.shape(j)):
+        if _fcl.touches(self.placed.own_shape(i), self.placed.own_shape(j)):
             return True
         witnesses = self.placed.witnesses
         return self._holds(i, witnesses[j : j + 1]) or self._holds(j, witnesses[i : i + 1])
 
     def _link_gap(self, i: int, j: int) -> float:
         """Distance between two solids of the robot; 0 where a mesh is touched."""
-        a, b = self.placed.shape(i), self.placed.shape(j)
+        a, b = self.placed.own_shape(i), self.placed.own_shape(j)
         return _fcl.gap(a, b) if a.hollow or b.hollow else _fcl.signed_gap(a, b)
 
     def _gap(self, i: int, b: int, owner: int) -> float:
@@ -258,7 +256,7 @@ class Queries:
             if not self._collide(int(i), int(j)):
                 continue
             # From the second link to the first: out of the contact for the one that is named.
-            touch = _fcl.deepest_touch(self.placed.shape(int(j)), self.placed.shape(int(i)))
+            touch = _fcl.deepest_touch(self.placed.own_shape(int(j)), self.placed.own_shape(int(i)))
             depth, point = 0.0, self.placed.witnesses[i]
             normal = _UP
             if touch is not None:

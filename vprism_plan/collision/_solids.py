@@ -33,6 +33,8 @@ class Solid:
             no surface cuts it this point tells which side all of it is on.
         vertices: (v, 3) of a mesh, link frame; None for primitives.
         mesh: closed `trimesh.Trimesh` whose inside counts, link frame; else None.
+        padding: metres of `shape` and `radius` that other links do not count.
+        own: the shape without padding, which other links are asked about; None: `shape`.
     """
 
     link: int
@@ -44,6 +46,8 @@ class Solid:
     witness: Float[np.ndarray, "3"]
     vertices: np.ndarray | None = None
     mesh: Any = None
+    padding: float = 0.0
+    own: Shape | None = None
 
     def holds(self, point: Float[np.ndarray, "3"]) -> bool:
         """Whether a point (link frame) is inside a closed mesh."""
@@ -94,8 +98,9 @@ def robot_solids(
             for sphere in np.flatnonzero(robot.sphere_links == index):
                 pose = np.eye(4)
                 pose[:3, 3] = in_link[sphere]
-                radius = (float(robot.sphere_radii[sphere]),)
-                solids.append(_primitive(index, int(sphere), "sphere", radius, pose))
+                padding = float(robot.arrays.link_padding[index])
+                radius = (float(robot.sphere_radii[sphere]) - padding,)
+                solids.append(_primitive(index, int(sphere), "sphere", radius, pose, padding))
     return solids
 
 
@@ -131,7 +136,10 @@ def _primitive(
     )
     shape = Shape(kind, size, padding=float(padding))
     center = np.array(T_link[:3, 3])
-    return Solid(link, sphere, shape, np.array(T_link), center, radius, center)
+    own = Shape(kind, size) if padding > 0.0 else None
+    return Solid(
+        link, sphere, shape, np.array(T_link), center, radius, center, padding=padding, own=own
+    )
 
 
 def _mesh_solids(link: int, name: str, mesh: Any) -> list[Solid]:
@@ -200,6 +208,12 @@ class PlacedSolids:
     def shape(self, i: int) -> Shape:
         """Return a solid's shape, moved to where `place` put it."""
         shape = self.solids[i].shape
+        shape.place(self.R[i], self.t[i])
+        return shape
+
+    def own_shape(self, i: int) -> Shape:
+        """The same without padding, which counts against the world only."""
+        shape = self.solids[i].own or self.solids[i].shape
         shape.place(self.R[i], self.t[i])
         return shape
 
