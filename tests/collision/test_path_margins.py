@@ -194,3 +194,16 @@ def test_nonsense_is_refused_by_name(ball_robot):
         max_safe_motion(checker, [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], tolerance=np.nan)
     with pytest.raises(RobotError, match="shape"):
         min_clearance(checker, np.zeros((0, 3)))
+
+
+def test_with_a_bound_on_risk_motion_stops_where_the_verdict_does(demo_map, demo_world, ball_robot):
+    seen, labels = demo_map.views[0].points()
+    middle = seen[labels == 3].mean(axis=0)
+    checker = CollisionChecker(demo_world, ball_robot(0.02), CheckerConfig(max_risk=0.05))
+    start = middle + np.array([0.0, 0.0, 0.25])
+    found = max_safe_motion(checker, start, middle - start, tolerance=0.002)
+    assert 0.0 < found.fraction < 1.0
+    along = np.linspace(0.0, found.fraction, 50)[:, None]
+    assert checker.is_valid_batch(start + along * (middle - start)).all()
+    assert not checker.is_valid(start + found.refused_at * (middle - start))
+    assert found.reason.contacts

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from vprism_plan.collision._packing import reach_table
 from vprism_plan.collision.protocols import Answers, Numbers, SphereRobot
@@ -166,12 +166,20 @@ def sphere_jacobians(
     local = arrays.sphere_center[spheres]
     centers = np.einsum("nij,nj->ni", R[rows, frames], local) + t[rows, frames]
     jacobian = np.zeros((len(Q), 3, Q.shape[1]))
-    for row in rows:
-        f = int(frames[row])
-        while f > 0:
-            axis = R[row, f] @ arrays.axis[f]
-            if arrays.kind[f] != KIND_PRISMATIC:
-                axis = np.cross(axis, centers[row] - t[row, f])
-            jacobian[row, :, arrays.q_index[f]] += arrays.q_mult[f] * axis
-            f = int(arrays.parent[f])
+    for f, carried in enumerate(_carried(arrays.parent)):
+        moved = np.flatnonzero(carried[frames])
+        if f == 0 or len(moved) == 0:
+            continue
+        axis = R[moved, f] @ arrays.axis[f]
+        if arrays.kind[f] != KIND_PRISMATIC:
+            axis = np.cross(axis, centers[moved] - t[moved, f])
+        jacobian[moved, :, arrays.q_index[f]] += arrays.q_mult[f] * axis
     return centers, jacobian
+
+
+def _carried(parent: Int[np.ndarray, " f"]) -> Bool[np.ndarray, "f f"]:
+    """Entry (f, g): whether frame g moves with frame f."""
+    table = np.eye(len(parent), dtype=bool)
+    for g in range(1, len(parent)):
+        table[:, g] |= table[:, parent[g]]
+    return table
