@@ -16,6 +16,7 @@ class DrawnVoxels:
         lower, upper = map_.support_bounds()
         self.first = np.floor(lower / resolution).astype(int)
         shape = np.ceil(upper / resolution).astype(int) - self.first + 1
+        self.lower, self.upper = lower, upper
         self.known = np.zeros(shape, bool)
         self.values = np.zeros((*shape, n_worlds), np.uint8)
 
@@ -33,21 +34,38 @@ class DrawnVoxels:
         out[inside] = self.values[tuple(local[inside].T)]
         return out
 
+    def beyond(self, center, radius):
+        """Whether a ball lies outside the box of the map's support."""
+        return bool(((center + radius < self.lower) | (center - radius > self.upper)).any())
+
 
 def ball_touches(owners_at, center, radius, resolution, steps, allowed=()):
     """Draws (S,) in which a ball touches, with the rounding that `PosteriorWorlds` states.
 
-    v is the voxel nearest to the centre c. An occupied voxel x counts if its distance
-    |v - x|, rounded down to 1 / `steps` of a voxel, is at most r + |c - v| rounded down.
+    An occupied voxel x counts as its inscribed ball. A draw touches unless one of the eight
+    nodes v around the centre c is farther from all of the draw's voxels than
+    r + 1/2 + |c - v| (voxels; distances rounded down to 1 / `steps`).
     """
+    if owners_at.beyond(center, radius + 4 * resolution):
+        return np.zeros(owners_at.n_worlds, bool)
     grid = center / resolution
-    v = np.floor(grid + 0.5).astype(int)
-    need = radius / resolution + np.linalg.norm(grid - v)
-    wide = int(need) + 2
-    offsets = np.indices((2 * wide + 1,) * 3).reshape(3, -1).T - wide
-    away = np.linalg.norm(offsets, axis=1)
-    index = v + offsets[np.floor(steps * away) <= np.floor(steps * need)]
-    return ~np.isin(owners_at(index), [0, *allowed]).all(axis=0)
+    low = np.floor(grid).astype(int)
+    need = radius / resolution + 0.5
+    wide = int(need) + 3
+    index = low + np.indices((2 * wide + 2,) * 3).reshape(3, -1).T - wide
+    index = index[np.linalg.norm(index - grid, axis=1) <= need + 2 * np.sqrt(3.0) + 0.2]
+    counts = np.ones(256, bool)
+    counts[[0, *allowed]] = False
+    occupied = counts[owners_at(index)]
+    some = occupied.any(axis=1)
+    index, occupied = index[some], occupied[some]
+    touched = np.ones(owners_at.n_worlds, bool)
+    for corner in np.indices((2, 2, 2)).reshape(3, -1).T:
+        node = low + corner
+        far = need + np.linalg.norm(grid - node)
+        away = np.linalg.norm(index - node, axis=1)
+        touched &= occupied[np.floor(steps * away) <= np.floor(steps * far)].any(axis=0)
+    return touched
 
 
 def inside_ball(center, radius, resolution):
@@ -59,11 +77,10 @@ def inside_ball(center, radius, resolution):
     return index[((resolution * index - center) ** 2).sum(axis=1) <= radius**2]
 
 
-def dense_touches(owners_at, arrays, path, resolution, margin=0.0, step=0.0005, allowed=None):
-    """Draws (S,) that occupy a voxel centre inside a sphere anywhere on the path.
+def dense_touches(owners_at, arrays, path, resolution, step=0.0005):
+    """Draws (S,) with a voxel whose inscribed ball meets a sphere anywhere on the path.
 
-    Edges are sampled so that sphere centres move about `step` metres at a time. allowed:
-    classes that each sphere may touch; None for none.
+    Edges are sampled so that sphere centres move about `step` metres at a time.
     """
     moving = np.flatnonzero(~np.asarray(arrays.link_fixed)[arrays.sphere_link])
     hit = np.zeros(owners_at.n_worlds, bool)
@@ -73,7 +90,10 @@ def dense_touches(owners_at, arrays, path, resolution, margin=0.0, step=0.0005, 
         for t in np.linspace(0.0, 1.0, max(2, int(1.2 * longest / step))):
             centers = sphere_positions(arrays, qa + t * (qb - qa))
             for s in moving:
-                index = inside_ball(centers[s], arrays.sphere_radius[s] + margin, resolution)
-                classes = [0, *(allowed[s] if allowed is not None else ())]
-                hit |= ~np.isin(owners_at(index), classes).all(axis=0)
+                if owners_at.beyond(centers[s], arrays.sphere_radius[s] + 0.5 * resolution):
+                    continue
+                index = inside_ball(
+                    centers[s], arrays.sphere_radius[s] + 0.5 * resolution, resolution
+                )
+                hit |= (owners_at(index) > 0).any(axis=0)
     return hit

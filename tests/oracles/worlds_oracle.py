@@ -24,28 +24,3 @@ def owners_of(logits):
 def draw_owners(map_, points, n_worlds, seed):
     """(n, S): what each draw says of each point."""
     return owners_of(draw_logits(map_, points, n_worlds, seed))
-
-
-def voxels_near(center, radius, resolution):
-    """Integer indices of all voxels whose centres are within `radius` of a point."""
-    low = np.floor((center - radius) / resolution).astype(int)
-    high = np.ceil((center + radius) / resolution).astype(int)
-    axes = [np.arange(a, b + 1) for a, b in zip(low, high, strict=True)]
-    index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return index[np.linalg.norm(resolution * index - center, axis=1) <= radius]
-
-
-def touched(owners_at, center, radius, resolution, n_worlds, allowed=()):
-    """The definition of a touch: draws that occupy a voxel x with |v - x| <= r + |c - v|.
-
-    v is the voxel nearest to the centre c; owners_at(index) -> (n, S).
-    """
-    v = np.floor(center / resolution + 0.5).astype(int)
-    reach = radius + np.linalg.norm(center - resolution * v)
-    index = voxels_near(resolution * v, reach + 2 * resolution, resolution)
-    apart = np.linalg.norm(resolution * (index - v), axis=1)
-    # The table rounds down to 1 / 16 of a voxel (1 / 8 for a long reach).
-    surely = owners_at(index[apart <= reach])
-    maybe = owners_at(index[apart <= reach + resolution / 8 + 1e-9])
-    counts = [np.isin(o, [0, *allowed], invert=True).any(axis=0) for o in (surely, maybe)]
-    return counts[0], counts[1]

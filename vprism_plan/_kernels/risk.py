@@ -121,65 +121,125 @@ def bake_block(owner_row, owners, counts, cx, cy, cz, reach, lut, wanted, out):
                     out[row, s] = lut[min(total[s], lut.size - 1)]
 
 
+# What a ball may be found to touch: nothing, what `hit` says, everything, or nobody knows yet.
+_NOTHING, _SOME, _ALL, _UNKNOWN = 0, 1, 2, -1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _touch_ball(  # noqa: PLR0911 (each return is a proof)
+    gx, gy, gz, ball, table, distance_row, rows, lowest, highest, scale, reach, hit
+):  # fmt: skip
+    """In which draws a ball touches something; fills hit (S,) only if the answer is `_SOME`.
+
+    gx, gy, gz: centre, in voxels of the table. ball: radius in voxels; every occupied voxel
+    counts as the ball inscribed in it.
+
+    A voxel centre x is within b = ball + 1/2 of c only if every node v of the cell around c
+    has |v - x| <= b + |c - v|: the draws for which no node proves the contrary touch.
+    """
+    _, ex, ey, ez = distance_row.shape
+    if not (0.0 <= gx <= ex - 1.0 and 0.0 <= gy <= ey - 1.0 and 0.0 <= gz <= ez - 1.0):
+        return _NOTHING
+    x = min(int(gx), ex - 2)
+    y = min(int(gy), ey - 2)
+    z = min(int(gz), ez - 2)
+    need = ball + 0.5
+    # The nearest node answers for most balls.
+    nx = int(gx + 0.5)
+    ny = int(gy + 0.5)
+    nz = int(gz + 0.5)
+    row = distance_row[table, nx, ny, nz]
+    if row < 0:
+        return _UNKNOWN if row == UNBAKED else _NOTHING
+    away = need + np.sqrt((gx - nx) ** 2 + (gy - ny) ** 2 + (gz - nz) ** 2)
+    if away >= reach:
+        return _ALL  # farther than the table knows: never "free"
+    if lowest[row] > np.uint8(away * scale):
+        return _NOTHING
+    every = True
+    for corner in range(8):
+        i = x + (corner >> 2)
+        j = y + ((corner >> 1) & 1)
+        k = z + (corner & 1)
+        row = distance_row[table, i, j, k]
+        if row < 0:
+            return _UNKNOWN if row == UNBAKED else _NOTHING
+        away = need + np.sqrt((gx - i) ** 2 + (gy - j) ** 2 + (gz - k) ** 2)
+        if away >= reach:
+            continue
+        limit = np.uint8(away * scale)
+        if highest[row] <= limit:
+            continue
+        if lowest[row] > limit:
+            return _NOTHING
+        values = rows[row]
+        if every:
+            every = False
+            for s in range(hit.size):
+                hit[s] = np.uint8(values[s] <= limit)
+        else:
+            for s in range(hit.size):
+                hit[s] &= np.uint8(values[s] <= limit)
+    return _ALL if every else _SOME
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mark_cell(gx, gy, gz, table, distance_row, wanted):
+    """Mark the blocks of the unbaked nodes of a cell."""
+    _, ex, ey, ez = distance_row.shape
+    x = min(int(gx), ex - 2)
+    y = min(int(gy), ey - 2)
+    z = min(int(gz), ez - 2)
+    for corner in range(8):
+        i = x + (corner >> 2)
+        j = y + ((corner >> 1) & 1)
+        k = z + (corner & 1)
+        if distance_row[table, i, j, k] == UNBAKED:
+            wanted[table, i // BLOCK, j // BLOCK, k // BLOCK] = True
+
+
 @njit(cache=True, nogil=True)
 def touch(
-    C, slack, radii, rules, distance_row, rows, lowest, highest, first, spacing, scale, reach,
+    C, slack, radii, tables, distance_row, rows, lowest, highest, first, spacing, scale, reach,
     touched, counts, first_sample, wanted,
 ):  # fmt: skip
-    """In which draws a ball of any sample touches something; returns how many voxels are unbaked.
+    """In which draws a ball of any sample touches something; returns how many balls met an
+    unbaked voxel.
 
-    C (n, 3, m) centres, metres; slack (n, m) metres added to radii (m,); rules (m,) the
-    contact rule of each ball, -1 = not checked. first (3,): index of the first voxel.
-
-    A ball about c touches an occupied voxel centre x only if the voxel v nearest to c has
-    |v - x| <= r + |c - v|; all voxels for which that holds count.
+    C (n, 3, m) centres, metres; slack (n, m) metres added to radii (m,); tables (m,) the
+    table of each ball, -1 = not checked. first (3,): index of the tables' first voxel.
 
     touched (S,): the draws that touch anywhere, kept from call to call; counts (n,): draws
     that touch at each sample; first_sample (S,): the sample that made `touched` true.
     wanted (blocks per axis): marked where a voxel is unbaked; counts mean nothing then.
     """
     n_draws = rows.shape[1]
-    _, ex, ey, ez = distance_row.shape
     here = np.empty(n_draws, np.uint8)
+    hit = np.empty(n_draws, np.uint8)
     missing = 0
     for i in range(C.shape[0]):
         here[:] = 0
         some = False
         for j in range(C.shape[2]):
-            rule = rules[j]
-            if rule < 0:
+            if tables[j] < 0:
                 continue
             gx = C[i, 0, j] / spacing - first[0]
             gy = C[i, 1, j] / spacing - first[1]
             gz = C[i, 2, j] / spacing - first[2]
-            if not (-0.5 < gx < ex - 0.5 and -0.5 < gy < ey - 0.5 and -0.5 < gz < ez - 0.5):
-                continue
-            x = int(gx + 0.5)
-            y = int(gy + 0.5)
-            z = int(gz + 0.5)
-            row = distance_row[rule, x, y, z]
-            if row < 0:
-                if row == UNBAKED:
-                    missing += 1
-                    wanted[rule, x // BLOCK, y // BLOCK, z // BLOCK] = True
-                continue
-            need = (radii[j] + slack[i, j]) / spacing
-            need += np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-            if need >= reach:
-                # Farther than the table knows: never "free".
-                here[:] = 1
+            ball = (radii[j] + slack[i, j]) / spacing
+            found = _touch_ball(
+                gx, gy, gz, ball, tables[j], distance_row, rows, lowest, highest, scale, reach, hit
+            )
+            if found == _SOME:
                 some = True
-                continue
-            limit = np.uint8(need * scale)
-            if lowest[row] > limit:
-                continue
-            some = True
-            if highest[row] <= limit:
+                for s in range(n_draws):
+                    here[s] |= hit[s]
+            elif found == _ALL:
+                some = True
                 here[:] = 1
-                continue
-            values = rows[row]
-            for s in range(n_draws):
-                here[s] |= np.uint8(values[s] <= limit)
+            elif found == _UNKNOWN:
+                missing += 1
+                _mark_cell(gx, gy, gz, tables[j], distance_row, wanted)
         counts[i] = 0
         if some:
             total = 0
@@ -195,42 +255,31 @@ def touch(
 
 @njit(cache=True, nogil=True)
 def touch_one(
-    C, radii, rules, distance_row, rows, lowest, highest, first, spacing, scale, reach, touched
+    C, radii, tables, distance_row, rows, lowest, highest, first, spacing, scale, reach, touched
 ):
     """`touch` for one sample C (3, m) without slack: how many draws touch, or -1 if a voxel
     is unbaked. touched (S,) must be zero. Fewer arrays make a quicker call."""
-    _, ex, ey, ez = distance_row.shape
     n_draws = rows.shape[1]
+    hit = np.empty(n_draws, np.uint8)
     some = False
     for j in range(C.shape[1]):
-        rule = rules[j]
-        if rule < 0:
+        if tables[j] < 0:
             continue
         gx = C[0, j] / spacing - first[0]
         gy = C[1, j] / spacing - first[1]
         gz = C[2, j] / spacing - first[2]
-        if not (-0.5 < gx < ex - 0.5 and -0.5 < gy < ey - 0.5 and -0.5 < gz < ez - 0.5):
-            continue
-        x = int(gx + 0.5)
-        y = int(gy + 0.5)
-        z = int(gz + 0.5)
-        row = distance_row[rule, x, y, z]
-        if row < 0:
-            if row == UNBAKED:
-                return -1
-            continue
-        need = radii[j] / spacing
-        need += np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-        if need >= reach or highest[row] <= np.uint8(need * scale):
-            touched[:] = 1
+        found = _touch_ball(
+            gx, gy, gz, radii[j] / spacing, tables[j], distance_row, rows, lowest, highest, scale,
+            reach, hit,
+        )  # fmt: skip
+        if found == _SOME:
+            some = True
+            for s in range(n_draws):
+                touched[s] |= hit[s]
+        elif found == _ALL:
             return n_draws
-        limit = np.uint8(need * scale)
-        if lowest[row] > limit:
-            continue
-        some = True
-        values = rows[row]
-        for s in range(n_draws):
-            touched[s] |= np.uint8(values[s] <= limit)
+        elif found == _UNKNOWN:
+            return -1
     total = 0
     if some:
         for s in range(n_draws):
@@ -240,111 +289,78 @@ def touch_one(
 
 @njit(cache=True, nogil=True)
 def touch_each(
-    centers, radii, distance_row, rows, first, spacing, scale, reach, out, wanted
+    centers, radii, table, distance_row, rows, lowest, highest, first, spacing, scale, reach,
+    out, wanted,
 ):  # fmt: skip
     """out (n, S): in which draws each ball (centers (n, 3), radii (n,)) touches something."""
-    ex, ey, ez = distance_row.shape
+    hit = np.empty(rows.shape[1], np.uint8)
     missing = 0
     for i in range(centers.shape[0]):
-        out[i] = False
         gx = centers[i, 0] / spacing - first[0]
         gy = centers[i, 1] / spacing - first[1]
         gz = centers[i, 2] / spacing - first[2]
-        if not (-0.5 < gx < ex - 0.5 and -0.5 < gy < ey - 0.5 and -0.5 < gz < ez - 0.5):
-            continue
-        x = int(gx + 0.5)
-        y = int(gy + 0.5)
-        z = int(gz + 0.5)
-        row = distance_row[x, y, z]
-        if row == UNBAKED:
+        found = _touch_ball(
+            gx, gy, gz, radii[i] / spacing, table, distance_row, rows, lowest, highest, scale,
+            reach, hit,
+        )  # fmt: skip
+        out[i] = found == _ALL
+        if found == _SOME:
+            for s in range(hit.size):
+                out[i, s] = hit[s] != 0
+        elif found == _UNKNOWN:
             missing += 1
-            wanted[x // BLOCK, y // BLOCK, z // BLOCK] = True
-        if row < 0:
-            continue
-        need = radii[i] / spacing + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-        if need >= reach:
-            out[i] = True
-            continue
-        limit = np.uint8(need * scale)
-        for s in range(rows.shape[1]):
-            out[i, s] = rows[row, s] <= limit
+            _mark_cell(gx, gy, gz, table, distance_row, wanted)
     return missing
 
 
 @njit(cache=True, nogil=True)
-def _nearest_owner(owner_row, owners, counts, s, x, y, z, low, high):
-    """Object class of an occupied voxel of draw s at a distance in [low, high] from a voxel,
-    the nearest one; 0 if there is none. Voxels."""
-    nx, ny, nz = owner_row.shape
-    wide = int(high) + 1
-    best = np.inf
-    found = 0
-    for a in range(max(x - wide, 0), min(x + wide + 1, nx)):
-        for b in range(max(y - wide, 0), min(y + wide + 1, ny)):
-            flat = (a - x) ** 2 + (b - y) ** 2
-            if flat > high * high:
-                continue
-            for c in range(max(z - wide, 0), min(z + wide + 1, nz)):
-                away = flat + (c - z) ** 2
-                if low * low <= away < best and away <= high * high:
-                    row = owner_row[a, b, c]
-                    if row >= 0 and counts[owners[row, s]]:
-                        best = away
-                        found = owners[row, s]
-    return found
-
-
-@njit(cache=True, nogil=True)
 def causes(
-    C, slack, radii, rules, distance_row, rows, first, spacing, scale, reach, first_sample,
-    counts, owner_row, owners, owner_first, sphere, owner,
+    C, slack, radii, tables, first, spacing, first_sample, counts, owner_row, owners,
+    sphere, owner,
 ):  # fmt: skip
     """Which ball touched first in each draw, and whose voxel: sphere (S,), owner (S,).
 
-    Of the balls that touch at the draw's first sample, the one that reaches deepest into
-    what is nearest to it. counts (g, 256): the classes that count under each rule. -1 and
-    0 where no draw touches. Everything asked about must be baked.
+    Of the balls at the draw's first sample, the one that reaches deepest into the occupied
+    voxel nearest to it. counts (g, 256): the classes that count under each table. first (3,)
+    is the first voxel of the owners. -1 and 0 where no draw touches. All must be drawn.
     """
-    _, ex, ey, ez = distance_row.shape
-    for s in range(owners.shape[1]):
-        sphere[s] = -1
-        owner[s] = 0
-        i = first_sample[s]
-        if i < 0:
+    nx, ny, nz = owner_row.shape
+    deepest = np.full(owners.shape[1], -np.inf)
+    sphere[:] = -1
+    owner[:] = 0
+    for i in range(C.shape[0]):
+        mine = np.flatnonzero(first_sample == i)
+        if mine.size == 0:
             continue
-        deepest = -np.inf
         for j in range(C.shape[2]):
-            if rules[j] < 0:
+            if tables[j] < 0:
                 continue
-            gx = C[i, 0, j] / spacing - first[0]
-            gy = C[i, 1, j] / spacing - first[1]
-            gz = C[i, 2, j] / spacing - first[2]
-            if not (-0.5 < gx < ex - 0.5 and -0.5 < gy < ey - 0.5 and -0.5 < gz < ez - 0.5):
-                continue
-            x = int(gx + 0.5)
-            y = int(gy + 0.5)
-            z = int(gz + 0.5)
-            row = distance_row[rules[j], x, y, z]
-            if row < 0:
-                continue
-            need = (radii[j] + slack[i, j]) / spacing
-            need += np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-            value = rows[row, s]
-            limit = np.uint8(need * scale) if need < reach else NOTHING
-            if value > limit or need * scale - value <= deepest:
-                continue
-            deepest = need * scale - value
-            sphere[s] = j
-            high = (value + 1) / scale if value != NOTHING else reach
-            owner[s] = _nearest_owner(
-                owner_row, owners, counts[rules[j]], s,
-                x + first[0] - owner_first[0], y + first[1] - owner_first[1],
-                z + first[2] - owner_first[2], max(value / scale - 1e-9, 0.0), high,
-            )  # fmt: skip
+            x = C[i, 0, j] / spacing - first[0]
+            y = C[i, 1, j] / spacing - first[1]
+            z = C[i, 2, j] / spacing - first[2]
+            ball = (radii[j] + slack[i, j]) / spacing + 0.5
+            wide = ball + 2.0  # what the nodes cannot rule out lies beyond by less than this
+            for a in range(max(int(x - wide), 0), min(int(x + wide) + 2, nx)):
+                for b in range(max(int(y - wide), 0), min(int(y + wide) + 2, ny)):
+                    flat = (a - x) ** 2 + (b - y) ** 2
+                    if flat > wide * wide:
+                        continue
+                    for c in range(max(int(z - wide), 0), min(int(z + wide) + 2, nz)):
+                        row = owner_row[a, b, c]
+                        if row < 0:
+                            continue
+                        depth = ball - np.sqrt(flat + (c - z) ** 2)
+                        if depth < -2.0:
+                            continue
+                        for s in mine:
+                            if depth > deepest[s] and counts[tables[j], owners[row, s]]:
+                                deepest[s] = depth
+                                sphere[s] = j
+                                owner[s] = owners[row, s]
 
 
 @njit(cache=True, nogil=True)
-def volume_codes(C, chosen, radii, rules, codes, origin, spacing, totals):
+def volume_codes(C, chosen, radii, tables, codes, origin, spacing, totals):
     """Add the balls' volume to totals (4,) by the code of the space it lies in; 3 is outside.
 
     C (n, 3, m): only the samples `chosen` count. Seven points per ball.
@@ -352,7 +368,7 @@ def volume_codes(C, chosen, radii, rules, codes, origin, spacing, totals):
     nx, ny, nz = codes.shape
     for i in chosen:
         for j in range(C.shape[2]):
-            if rules[j] < 0:
+            if tables[j] < 0:
                 continue
             weight = radii[j] ** 3 / 7.0
             for p in range(7):

@@ -2,37 +2,16 @@
 """Names what the worlds in which a robot collides collide with."""
 
 from collections import Counter
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan._kernels import checking, risk
+from vprism_plan.collision._counting import Sweep
 from vprism_plan.collision._explain import nearest_source
 from vprism_plan.collision._risk_setting import Setting
 from vprism_plan.collision.reports import Contact
 from vprism_plan.collision.risk import FirstContact
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """Samples of a path and what they touch.
-
-    Attributes:
-        centers: (n, 3, S) sphere centres, metres.
-        slack: (n, S) metres by which the spheres grow to cover the way to the next sample.
-        waypoints: (T,) samples that are waypoints.
-        touched: (n_worlds,) worlds that touch anything.
-        counts: (n,) worlds that touch at each sample.
-        first: (n_worlds,) sample of the first touch, -1 if none.
-    """
-
-    centers: Float[np.ndarray, "n 3 s"]
-    slack: Float[np.ndarray, "n s"]
-    waypoints: Int[np.ndarray, " t"]
-    touched: np.ndarray
-    counts: Int[np.ndarray, " n"]
-    first: Int[np.ndarray, " w"]
 
 
 def first_contacts(
@@ -96,13 +75,10 @@ def _touching(
     """Count (sphere, owner, sample) of the first touch over the worlds."""
     n = len(first)
     sphere, owner = np.empty(n, np.int64), np.empty(n, np.int64)
-    worlds, tables = at.worlds, at.worlds.tables
-    rows, owners, origin = worlds.owner_tables
-    scale, reach = worlds.scale
+    rows, owners, origin = at.worlds.owner_tables
     risk.causes(
-        sweep.centers, sweep.slack, at.radii, at.sphere_tables, tables.distance_row,
-        tables.rows, worlds.first, worlds.resolution, scale, reach, first,
-        worlds.counting(), rows, owners, origin, sphere, owner,
+        sweep.centers, sweep.slack, at.radii, at.sphere_tables, origin, at.worlds.resolution,
+        first, at.worlds.counting(), rows, owners, sphere, owner,
     )  # fmt: skip
     hit = np.flatnonzero(sphere >= 0)
     return Counter((int(sphere[s]), int(owner[s]), int(first[s])) for s in hit)

@@ -65,10 +65,9 @@ class Queries:
         """Return the probability that a path (or a configuration) touches anything.
 
         The share of worlds, drawn from the map's posterior, in which any sphere of any
-        moving link comes within `config.margin` of an occupied voxel that it may not touch,
-        or of a certain obstacle, anywhere on the path: the same world for the whole path.
-        Edges are straight in joint space and swept without gaps. Self-collision and joint
-        limits do not enter.
+        moving link touches an occupied voxel that it may not touch, or a certain obstacle,
+        anywhere on the path: the same world for the whole path. Edges are straight in joint
+        space and swept without gaps. Margin, self-collision and joint limits do not enter.
 
         Args:
             path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.

@@ -14,9 +14,10 @@ from vprism_plan.world import PosteriorWorlds
 
 # Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
 PADDINGS = (0.5, 1.0, 2.0)
-# Voxels between a sphere's surface and the farthest voxel it is compared with: the centre's
-# offset, half a voxel between samples, and room to spare.
-_ROOM = 2.5
+# Voxels between a sphere's surface and the farthest voxel it is compared with: the way to
+# the far node of its centre's cell, half a voxel each for a voxel's own size and for the way
+# between samples, and room to spare.
+_ROOM = 3.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class Setting:
         robot: whose spheres are asked about.
         config: margin, worlds, seed and confidence.
         worlds: the draws.
-        radii: (S,) metres, the margin included.
+        radii: (S,) metres.
         tables: (rules,) the table of `worlds` that holds for each contact rule.
         sphere_tables: (S,) the table that holds for each sphere; -1 is not checked.
         fields: distance to the certain obstacles, one per contact rule.
@@ -51,6 +52,16 @@ class Setting:
     spacing: float
 
 
+def with_margin(setting: Setting, margin: float) -> Setting:
+    """Return the same for spheres that must keep `margin` (metres) more than not touching."""
+    distance, blocks, floats = setting.packed
+    floats = floats.copy()
+    floats[6] += margin
+    return dataclasses.replace(
+        setting, radii=setting.radii + margin, packed=(distance, blocks, floats)
+    )
+
+
 def make_setting(
     world: RuledWorld,
     robot: SphereRobot,
@@ -69,15 +80,15 @@ def make_setting(
     """
     arrays = robot.arrays
     moving = ~np.asarray(arrays.link_fixed)[arrays.sphere_link]
-    radii = arrays.sphere_radius + config.margin
+    radii = arrays.sphere_radius
     resolution = float(world.field.spacing)
     room = _ROOM if config.max_risk is None else _ROOM + PADDINGS[-1]
-    reach = float(np.max(radii[moving], initial=0.0)) + room * resolution
+    reach = float(np.max(radii[moving], initial=0.0)) + config.margin + room * resolution
     worlds = world.posterior_worlds(config.n_worlds, config.risk_seed, reach=reach)
     tables = np.array([worlds.rule(ids) for ids in rules], dtype=np.int64)
     per_link = np.where(arrays.link_fixed, -1, tables[link_rules])
     fields = tuple(world.certain_field(ids) for ids in rules)
-    baked = pack_world(world, fields, config.margin)
+    baked = pack_world(world, fields, 0.0)
     alone = dataclasses.replace(arrays, pairs=np.empty((0, 2), np.int64))
     packed = pack_robot(alone, rules=link_rules)
     _open_limits(packed.floats, packed.ints)

@@ -195,7 +195,7 @@ class CollisionChecker(Queries):
             state = self.explain(interpolate(self.robot, qa, qb, fraction))
         elif self._bounded is not None and not valid:
             edge = np.stack([qa, qb])
-            risk, fraction = self._bounded.estimate(edge), self._bounded.exceeded_at(edge)
+            risk, fraction = self._bounded.estimate(edge, True), self._bounded.exceeded_at(edge)
         return MotionReport(
             valid=valid,
             certified=valid and bool(stats[2] <= _ROUNDING),

@@ -25,8 +25,8 @@ class CheckerConfig:
         max_risk: Bound on the probability of collision. With a bound, the objects of the
             map (and occluded space where the map has support) are judged by worlds drawn
             from its posterior instead of by the level set: a configuration or an edge is
-            free if the upper confidence bound of its probability of collision is within
-            `max_risk`. Everything else is refused as without a bound. None: level set.
+            free if the upper confidence bound of its probability of coming within `margin`
+            is at most `max_risk`. Everything else is refused as without a bound. None: level set.
         allowed_contacts: Link or SRDF group -> ids of the objects it may touch; for
             example {"hand": {3}}. What a link may touch, it may also pass through.
         n_worlds: Worlds drawn for probabilities, a multiple of 64.

@@ -39,9 +39,10 @@ class PosteriorWorlds:
     holds everywhere, so what hides in one place is correlated with what hides next to it.
 
     Per voxel and draw one byte holds the distance to the nearest occupied voxel centre,
-    rounded down: any ball is one comparison of S bytes, whatever its radius, and errs
-    only to "touches": by twice the way from its centre to the nearest voxel's, so by less
-    than 1.74 voxels, and by 1 / 16 (at most 1 / 8) of a voxel.
+    rounded down, so any ball is a comparison of S bytes at the nodes of the cell around its
+    centre, whatever its radius. An occupied voxel counts as the ball inscribed in it. What
+    the nodes cannot rule out is touched: an error is always to "touches", by at most 1.74
+    voxels, a tenth to a fifth of a voxel as a rule.
 
     Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when
     the first ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the
@@ -53,7 +54,7 @@ class PosteriorWorlds:
         n_worlds: number of draws S, a multiple of 64.
         seed: of the draws; the same seed, the same worlds.
         resolution: edge of a voxel, metres; centres are whole multiples of it.
-        reach: distances up to this are known, metres: one and a half voxels more than the
+        reach: distances up to this are known, metres: two and a half voxels more than the
             largest ball that will be asked about. At most 31 voxels.
         tolerance: how probable it may be that skipping the draws of nearly certain voxels
             changes any answer (see `error_free`, `error_occupied`).
@@ -112,6 +113,7 @@ class PosteriorWorlds:
         self._lut = np.floor(self._scale * np.sqrt(squares)).clip(max=254).astype(np.uint8)
         self._lut[squares > self._reach**2] = kernels.NOTHING
         self._grown = self._grow()
+        self._first_table = self._first_voxel - self._whole
         self._rules: list[frozenset[int]] = [frozenset()]
         self._tables = Tables(
             self._grown[None].copy(),
@@ -204,14 +206,15 @@ class PosteriorWorlds:
         out = np.empty((len(centers), self.n_worlds), np.bool_)
         while True:
             tables = self._tables
-            wanted = np.zeros(self._blocks_of_table(), np.bool_)
+            wanted = self.new_marks()
             missing = kernels.touch_each(
-                centers, radii, tables.distance_row[rule], tables.rows, self.first,
-                self.resolution, self._scale, self._reach, out, wanted,
+                centers, radii, rule, tables.distance_row, tables.rows, tables.lowest,
+                tables.highest, self.first, self.resolution, self._scale, self._reach,
+                out, wanted,
             )  # fmt: skip
             if not missing:
                 return out
-            self._bake(rule, np.argwhere(wanted))
+            self.bake_marked(wanted)
 
     def bake(self, lower: Any = None, upper: Any = None, without: Collection[int] = ()) -> None:
         """Draw and bake every block that a box (corners, world, metres) meets; None is all."""
@@ -244,7 +247,7 @@ class PosteriorWorlds:
     @property
     def first(self) -> Int[np.ndarray, " 3"]:
         """Index of the tables' first voxel."""
-        return self._first_voxel - self._whole
+        return self._first_table
 
     @property
     def tables(self) -> Tables:
@@ -303,10 +306,10 @@ class PosteriorWorlds:
         largest = float(np.max(radii, initial=0.0))
         if not (np.isfinite(radii).all() and np.min(radii, initial=0.0) >= 0.0):
             raise WorldError("radii must be finite and at least 0 metres")
-        if largest / self.resolution + 0.8661 >= self._reach:
+        if largest / self.resolution + 2.2321 >= self._reach:
             raise WorldError(
                 f"a ball of radius {largest} m is beyond reach={self.reach} m; build the worlds "
-                f"with reach of at least {largest + self.resolution:.3f} m"
+                f"with reach of at least {largest + 2.5 * self.resolution:.3f} m"
             )
 
     # --- drawing and baking ----------------------------------------------------------
