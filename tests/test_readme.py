@@ -4,6 +4,8 @@ import re
 import subprocess
 import sys
 
+import pytest
+
 
 def blocks(text, language):
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.S)
@@ -21,8 +23,22 @@ def test_the_python_example_runs_and_plans(repository):
     assert "panda_" in reasons
 
 
+@pytest.mark.slow
+def test_what_the_readme_shows_of_risk_contacts_and_margins_runs_after_the_first_example(
+    repository,
+):
+    first, second = blocks((repository / "README.md").read_text(), "python")[:2]
+    done = subprocess.run(
+        [sys.executable, "-c", first + second],
+        cwd=repository, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("P(collision)") >= 2
+    assert "ends touching, as allowed: panda_hand on object:1" in done.stdout
+
+
 def test_the_ompl_lines_are_those_of_the_example(repository):
-    shown = blocks((repository / "README.md").read_text(), "python")[1]
+    shown = blocks((repository / "README.md").read_text(), "python")[2]
     program = (repository / "examples" / "own_ompl_program.py").read_text()
     lines = [line.split("#")[0].strip() for line in shown.splitlines() if line.strip()]
     assert len(lines) <= 10
