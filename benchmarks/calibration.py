@@ -89,7 +89,7 @@ def picture(voxels: VoxelCalibration, paths: PathCalibration, file: Path) -> Non
             [r.observed for r in reported.rows()],
             color="#c05030", marker="s", label=f"rounded to the safe side, ECE {reported.ece:.3f}",
         )  # fmt: skip
-        right.legend(loc="upper left")
+        right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
     save_figure(figure, file)
 
 
@@ -156,6 +156,11 @@ def report(
         f"Upper 95 % bound below 1 percent: {safe} paths, of which {collided} really "
         f"collide{share}.", "", "As reported:", "", table(reported), "",
         "As defined:", "", table(defined), "",
+        f"Most sweeps are clear cases, and they make these errors small: only "
+        f"{sum(defined.counts[1:-1])} of {defined.n} lie between 0.1 and 0.9 as defined, "
+        f"{sum(reported.counts[1:-1])} as reported. Among those the figure as reported is too "
+        "high by design (a voxel's width of caution), and the figure as defined misses grazes "
+        "shallower than a voxel.", "",
     ]  # fmt: skip
     return "\n".join(out)
 

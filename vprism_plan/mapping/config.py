@@ -75,8 +75,9 @@ class MapConfig:
     Hinge points
         hinge_spacing: edge of the lattice cell, m. It decides how much the answers
             depend on where the lattice happens to lie: shifted by half a cell, the risk of
-            a path moves by up to 0.5 at 1.8 kernel lengths, 0.1 at 1.5 (the default) and
-            0.05 at 1.25 (`fine`).
+            a path behind a ball moves by up to 0.43 at 1.8 kernel lengths, 0.15 at 1.5
+            (the default; tested: at most 0.2) and 0.06 at 1.25 (`fine`; 0.08). Nearly all
+            of that is in paths that just touch (`docs/results/lattice.md`).
         hinge_shift: offset of the lattice from multiples of the spacing, m.
         hinge_radius: lattice nodes are kept this near an object's box centre, m ...
         hinge_margin: ... or this near its axis-aligned box, m.
@@ -210,7 +211,7 @@ class MapConfig:
         """Return the default with a finer lattice, nearer to convergence.
 
         Its spacing is 1.25 kernel lengths; take it where probabilities matter more than
-        fitting time (about four times the default's).
+        fitting time (four to five times the default's).
         """
         return cls(hinge_spacing=0.028, iterations=10)
 
