@@ -104,7 +104,9 @@ def make_setting(
         packed=(baked.distance, baked.blocks, baked.floats),
         floats=packed.floats,
         ints=packed.ints,
-        spacing=min(resolution, 0.5 * float(world.map.kernel_length)),
+        # Half a voxel: with a whole one, the room for the way between samples let layers of
+        # voxels in and out as a path was divided differently.
+        spacing=0.5 * min(resolution, float(world.map.kernel_length)),
     )
 
 
