@@ -9,30 +9,33 @@ from oracles.worlds_oracle import draw_owners
 
 
 class DrawnVoxels:
-    """What each draw says of each voxel, straight from the definition; remembers answers."""
+    """What each draw says of each voxel of a small map, straight from the definition."""
 
     def __init__(self, map_, n_worlds, seed, resolution):
-        self.map, self.n_worlds, self.seed, self.resolution = map_, n_worlds, seed, resolution
-        lower, upper = map_.support_bounds()
-        self.first = np.floor(lower / resolution).astype(int)
-        shape = np.ceil(upper / resolution).astype(int) - self.first + 1
-        self.lower, self.upper = lower, upper
-        self.known = np.zeros(shape, bool)
+        self.n_worlds = n_worlds
+        self.lower, self.upper = map_.support_bounds()
+        self.first = np.floor(self.lower / resolution).astype(int)
+        shape = np.ceil(self.upper / resolution).astype(int) - self.first + 1
         self.values = np.zeros((*shape, n_worlds), np.uint8)
+        index = np.indices(shape).reshape(3, -1).T
+        for part in np.array_split(index, len(index) // 20_000 + 1):
+            points = resolution * (part + self.first)
+            self.values[tuple(part.T)] = draw_owners(map_, points, n_worlds, seed)
+        self.possible = self.values.any(axis=3)
 
     def __call__(self, index):
         """(n, 3) voxel indices -> (n, S) classes; nothing is outside the map's support."""
         local = np.asarray(index) - self.first
-        inside = ((local >= 0) & (local < self.known.shape)).all(axis=1)
-        new = np.unique(local[inside][~self.known[tuple(local[inside].T)]], axis=0)
-        for part in np.array_split(new, len(new) // 5000 + 1):
-            points = self.resolution * (part + self.first)
-            where = tuple(part.T)
-            self.values[where] = draw_owners(self.map, points, self.n_worlds, self.seed)
-            self.known[where] = True
+        inside = ((local >= 0) & (local < self.possible.shape)).all(axis=1)
         out = np.zeros((len(local), self.n_worlds), np.uint8)
         out[inside] = self.values[tuple(local[inside].T)]
         return out
+
+    def occupiable(self, index):
+        """Those of the voxels (n, 3) that any draw occupies."""
+        local = np.asarray(index) - self.first
+        index = index[((local >= 0) & (local < self.possible.shape)).all(axis=1)]
+        return index[self.possible[tuple((index - self.first).T)]]
 
     def beyond(self, center, radius):
         """Whether a ball lies outside the box of the map's support."""
@@ -54,11 +57,10 @@ def ball_touches(owners_at, center, radius, resolution, steps, allowed=()):
     wide = int(need) + 3
     index = low + np.indices((2 * wide + 2,) * 3).reshape(3, -1).T - wide
     index = index[np.linalg.norm(index - grid, axis=1) <= need + 2 * np.sqrt(3.0) + 0.2]
+    index = owners_at.occupiable(index)
     counts = np.ones(256, bool)
     counts[[0, *allowed]] = False
     occupied = counts[owners_at(index)]
-    some = occupied.any(axis=1)
-    index, occupied = index[some], occupied[some]
     touched = np.ones(owners_at.n_worlds, bool)
     for corner in np.indices((2, 2, 2)).reshape(3, -1).T:
         node = low + corner
@@ -95,5 +97,5 @@ def dense_touches(owners_at, arrays, path, resolution, step=0.0005):
                 index = inside_ball(
                     centers[s], arrays.sphere_radius[s] + 0.5 * resolution, resolution
                 )
-                hit |= (owners_at(index) > 0).any(axis=0)
+                hit |= (owners_at(owners_at.occupiable(index)) > 0).any(axis=0)
     return hit

@@ -15,7 +15,7 @@ def at(x, y, z):
     return pose
 
 
-def small_camera(elevation=28.0):
+def small_camera(elevation=20.0):
     """Looks along +x, so that shadows fall towards +x."""
     return Camera.orbit(np.array([0.0, 0.0, 0.03]), 1.0, np.pi, np.deg2rad(elevation))
 
@@ -28,8 +28,9 @@ def small_scene():
 
 def small_config(**changes):
     """Few hinges, close to the objects; unsure of what it does not see."""
-    numbers = {"hinge_spacing": 0.05, "hinge_radius": 0.07, "hinge_margin": 0.04}
-    return MapConfig(**{"surface_hinges": 8, "iterations": 2, **numbers, **changes})
+    numbers = {"hinge_spacing": 0.04, "hinge_radius": 0.07, "hinge_margin": 0.05}
+    prior = {"prior_logit_variance": 60.0, "prior_occupancy": 0.45}
+    return MapConfig(**{"surface_hinges": 8, "iterations": 2, **numbers, **prior, **changes})
 
 
 def small_map(**changes):

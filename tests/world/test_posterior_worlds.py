@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 from oracles.risk_oracle import DrawnVoxels, ball_touches, inside_ball
 from oracles.small_scenes import at, small_camera, small_config, small_map, small_scene
-from oracles.worlds_oracle import draw_logits, draw_owners, owners_of, touched
+from oracles.worlds_oracle import draw_logits, draw_owners, owners_of
 
 import vprism_plan as vp
 from vprism_plan.errors import WorldError
@@ -47,7 +47,7 @@ def some_map(request):
 
 @pytest.fixture(scope="module")
 def worlds(small):
-    return PosteriorWorlds(small, n_worlds=S, seed=5, resolution=H, reach=0.12, tolerance=0.0)
+    return PosteriorWorlds(small, n_worlds=S, seed=5, resolution=H, reach=0.15, tolerance=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -221,21 +221,34 @@ def test_touching_is_never_missed_nor_claimed_beyond_the_slack(worlds, drawn, se
     centers, radii = balls_near(worlds.map, rng, 6, 0.07)
     ours = worlds.touched(centers, radii, gone)
     for center, radius, mine in zip(centers, radii, ours, strict=True):
-        inside = drawn(inside_ball(center, radius, H))
+        # Every occupied voxel counts as the ball inscribed in it.
+        inside = drawn(inside_ball(center, radius + 0.5 * H, H))
         truly = ~np.isin(inside, [0, *classes]).all(axis=0)
-        assert not (truly & ~mine).any(), "a voxel centre inside the ball was missed"
-        at_least, at_most = touched(drawn, center, radius, H, S, classes)
-        assert not (at_least & ~mine).any()
-        assert not (mine & ~at_most).any()
+        assert not (truly & ~mine).any(), "a voxel that meets the ball was missed"
         exact = ball_touches(drawn, center, radius, H, worlds.scale[0], classes)
         np.testing.assert_array_equal(mine, exact)
-        near = drawn(inside_ball(center, radius + (1.74 + 1 / 8) * H, H))
+        near = drawn(inside_ball(center, radius + (0.5 + 1.74 + 1 / 8) * H, H))
         assert not (mine & np.isin(near, [0, *classes]).all(axis=0)).any(), "more than stated"
+
+
+def test_what_the_nodes_cannot_rule_out_is_little(worlds, drawn):
+    """Of draws called touching, few have no voxel within a quarter of a voxel of the ball."""
+    rng = np.random.default_rng(4)
+    centers, radii = balls_near(worlds.map, rng, 150, 0.06)
+    ours = worlds.touched(centers, radii)
+    exact, nearly = (
+        np.array([(drawn(inside_ball(c, r + extra * H, H)) > 0).any(axis=0)
+                  for c, r in zip(centers, radii, strict=True)])
+        for extra in (0.5, 0.75)
+    )  # fmt: skip
+    wrong = ours & ~exact
+    assert wrong.mean() < 0.03
+    assert (ours & ~nearly).mean() < 0.01
 
 
 def test_a_voxel_centre_on_the_sphere_counts(small):
     """Balls around voxel centres with radii of whole voxels: rounding must not lose the rim."""
-    worlds = PosteriorWorlds(small, S, 0, tolerance=0.0, reach=0.3)
+    worlds = PosteriorWorlds(small, S, 0, tolerance=0.0, reach=0.31)
     index = support_voxels(small)
     occupied = worlds.owners(index) > 0
     rim = index[(occupied.any(axis=1)) & ~(occupied.all(axis=1))]
@@ -257,7 +270,10 @@ def test_without_every_object_nothing_is_touched(worlds):
     each = [
         worlds.touched(centers, radii, [i for i in everything if i != kept]) for kept in everything
     ]
-    np.testing.assert_array_equal(np.any(each, axis=0), worlds.touched(centers, radii))
+    whole = worlds.touched(centers, radii)
+    assert not (np.any(each, axis=0) & ~whole).any()
+    # Nodes of one cell may blame different objects, for which no single object answers.
+    assert (whole & ~np.any(each, axis=0)).mean() < 0.001
 
 
 def test_larger_balls_touch_more(worlds):
@@ -278,7 +294,7 @@ def test_lazy_baking_is_eager_baking(small):
     rng = np.random.default_rng(2)
     centers, radii = balls_near(small, rng, 150, 0.08)
     lower, upper = small.support_bounds()
-    lazy, eager, region = (PosteriorWorlds(small, S, 3, reach=0.1) for _ in range(3))
+    lazy, eager, region = (PosteriorWorlds(small, S, 3, reach=0.12) for _ in range(3))
     eager.bake()
     held = eager.nbytes
     region.bake(0.5 * (lower + upper), upper)
@@ -293,7 +309,7 @@ def test_lazy_baking_is_eager_baking(small):
 
 
 def test_nbytes_is_about_what_is_held(small):
-    worlds = PosteriorWorlds(small, S, 3, reach=0.1)
+    worlds = PosteriorWorlds(small, S, 3, reach=0.12)
     before = worlds.nbytes
     worlds.bake()
     tables = worlds.tables
@@ -310,9 +326,9 @@ def test_threads_that_ask_at_once_get_what_one_gets(small):
     rng = np.random.default_rng(6)
     centers, radii = balls_near(small, rng, 120, 0.08)
     ids = small.object_ids
-    alone = PosteriorWorlds(small, S, 3, reach=0.1)
+    alone = PosteriorWorlds(small, S, 3, reach=0.12)
     expected = {gone: alone.touched(centers, radii, gone) for gone in ((), (ids[0],), (ids[1],))}
-    shared = PosteriorWorlds(small, S, 3, reach=0.1)
+    shared = PosteriorWorlds(small, S, 3, reach=0.12)
     failures = []
 
     def ask(number):
@@ -366,7 +382,7 @@ def test_wrong_questions_are_refused_by_name(worlds):
         ask.touched(point, -0.01)
     with pytest.raises(WorldError, match="beyond reach") as caught:
         ask.touched(point, 0.2)
-    assert "0.210" in str(caught.value)  # the remedy: a reach that would do
+    assert "0.225" in str(caught.value)  # the remedy: a reach that would do
     with pytest.raises(WorldError, match="no object 99"):
         ask.touched(point, 0.01, without=[99])
     for index in (np.zeros((2, 2), int), np.zeros((2, 3)), np.zeros(3, int)):
