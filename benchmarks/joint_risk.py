@@ -161,8 +161,8 @@ def results_text(data: dict, parts: dict, shifts: dict, changes: np.ndarray, n_w
     ]
     text.append(
         "The picture shows 60 mm, where the rules differ most visibly; from 70 mm on this map "
-        "says next to 0, and below 60 mm it mostly says yes. At these offsets the joint risk does not "
-        "change as waypoints double; on random paths it does, see below.\n"
+        "says next to 0, and below 60 mm it mostly says yes. At these offsets the joint risk "
+        "does not change as waypoints double; on random paths it does, see below.\n"
     )
     for n_balls, rows in data.items():
         text.append(f"\n## Past {'one ball' if n_balls == 1 else 'two balls'}\n")
