@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """How much does a path's risk change when the hinge lattice moves by half a cell?
 
-    python benchmarks/lattice.py [--scenes 6] [--first-seed 0]
+    python benchmarks/lattice.py [--scenes 12] [--first-seed 0]
 
 Balls on a table and 2 cm balls swept behind them; the lattice shifted along each axis and
 along all. Writes docs/results/lattice.md.
@@ -29,7 +29,7 @@ CONFIGS = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=6)
+    parser.add_argument("--scenes", type=int, default=12)
     parser.add_argument("--first-seed", type=int, default=0)
     args = parser.parse_args()
     lines = [
@@ -38,19 +38,26 @@ def main() -> None:
         f"axis or all three: {args.scenes} balls of 3 to 5 cm, a 2 cm ball swept 20 cm behind "
         "each, touching it or 0.5 to 3 cm farther; 2048 worlds (standard error of a difference "
         "at most 0.016).", "",
-        "| hinges | largest change | its median over scenes | seconds of a fit with its draws |",
+        "The sweep that just touches stands for the worst: there a millimetre decides. `passing` "
+        "are the sweeps 0.5 cm and more behind the ball.", "",
+        "| hinges | touching: largest, median of the scenes | passing: largest "
+        "| seconds of a fit with its draws |",
         "|---|---|---|---|",
     ]  # fmt: skip
     for name, config in CONFIGS.items():
-        changes = []
+        touching, passing = [], []
         start = time.process_time()
         for seed in range(args.first_seed, args.first_seed + args.scenes):
             scene, ends = ball_scene(seed)
             shift = shift_lattice(scene, ends, config)
-            changes.append(shift.largest)
+            touching.append(shift.change[0])
+            passing.append(shift.change[1:].max())
             print(name, seed, np.round(shift.risks, 2).tolist(), flush=True)
         spent = (time.process_time() - start) / (5 * args.scenes)
-        lines.append(f"| {name} | {max(changes):.3f} | {np.median(changes):.3f} | {spent:.2f} |")
+        lines.append(
+            f"| {name} | {max(touching):.3f}, {np.median(touching):.3f} | {max(passing):.3f} "
+            f"| {spent:.2f} |"
+        )
     write_text(ROOT / "docs" / "results" / "lattice.md", "\n".join(lines) + "\n")
     print("\n".join(lines))
 

@@ -8,11 +8,13 @@ from vprism_plan.mapping import MapConfig
 
 
 @pytest.mark.parametrize(
-    ("config", "tolerance"),
-    [(MapConfig(), 0.2), (MapConfig.fine(), 0.08)],
+    ("config", "touching"),
+    [(MapConfig(), 0.45), (MapConfig.fine(), 0.1)],
     ids=["default", "fine"],
 )
-def test_half_a_cell_moves_no_risk_by_more_than_the_stated_tolerance(config, tolerance):
-    scene, ends = ball_scene(1)
-    shift = shift_lattice(scene, ends, config, n_worlds=1024)
-    assert shift.largest <= tolerance
+def test_half_a_cell_moves_no_risk_by_more_than_the_stated_tolerance(config, touching):
+    """The worst of twelve balls: 0.05 for paths 5 mm and more behind it, more where one touches."""
+    scene, ends = ball_scene(9)
+    change = shift_lattice(scene, ends, config, n_worlds=1024).change
+    assert change[0] <= touching
+    assert change[1:].max() <= 0.05

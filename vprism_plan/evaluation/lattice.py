@@ -30,9 +30,9 @@ class LatticeShift:
     risks: Float[np.ndarray, "s p"]
 
     @property
-    def largest(self) -> float:
-        """The largest change of any path's risk by a shift."""
-        return float(np.abs(self.risks[1:] - self.risks[0]).max())
+    def change(self) -> Float[np.ndarray, " p"]:
+        """The largest change of each path's risk by a shift."""
+        return np.asarray(np.abs(self.risks[1:] - self.risks[0]).max(axis=0))
 
 
 def ball_scene(seed: int) -> tuple[Scene, Float[np.ndarray, "p 2 3"]]:

@@ -74,10 +74,10 @@ class MapConfig:
         kernel_cutoff: kernel values below this are exactly 0.
     Hinge points
         hinge_spacing: edge of the lattice cell, m. It decides how much the answers
-            depend on where the lattice happens to lie: shifted by half a cell, the risk of
-            a path behind a ball moves by up to 0.43 at 1.8 kernel lengths, 0.15 at 1.5
-            (the default; tested: at most 0.2) and 0.06 at 1.25 (`fine`; 0.08). Nearly all
-            of that is in paths that just touch (`docs/results/lattice.md`).
+            depend on where the lattice happens to lie. Shifted by half a cell, the risk of
+            a path 5 mm or more behind a ball moves by at most 0.05 at 1.5 kernel lengths
+            (the default) and at 1.25 (`fine`); of one that just touches, where a
+            millimetre decides, by up to 0.4 and 0.1 (`docs/results/lattice.md`).
         hinge_shift: offset of the lattice from multiples of the spacing, m.
         hinge_radius: lattice nodes are kept this near an object's box centre, m ...
         hinge_margin: ... or this near its axis-aligned box, m.
