@@ -132,12 +132,11 @@ def oracle_counts(checker, drawn, path, allowed=None):
     moving = np.flatnonzero(~np.asarray(arrays.link_fixed)[arrays.sphere_link])
     radii = arrays.sphere_radius
     touched = np.zeros((len(rows), drawn.n_worlds), bool)
-    scale = setting(checker).worlds.scale[0]
     for i in range(len(rows)):
         for s in moving:
             classes = () if allowed is None else allowed[s]
             radius = radii[s] + sweep.slack[i, s]
-            touched[i] |= ball_touches(drawn, sweep.centers[i, :, s], radius, H, scale, classes)
+            touched[i] |= ball_touches(drawn, sweep.centers[i, :, s], radius, H, classes)
     return touched, steps
 
 
@@ -221,7 +220,7 @@ def test_nor_for_random_robots(free_world, drawn, seed):
 @settings(max_examples=40)
 @given(seeds, st.floats(0.005, 0.2))
 def test_slack_covers_the_way_between_samples(seed, spacing):
-    """Any point between two samples is within its sphere's slack of one of the two."""
+    """What a sphere holds between two samples, it holds at one of the two, grown by its slack."""
     rng = np.random.default_rng(seed)
     arrays = random_arrays(rng, dof=int(rng.integers(1, 6)))
     robot = as_robot(arrays)
@@ -234,6 +233,7 @@ def test_slack_covers_the_way_between_samples(seed, spacing):
     kernels.place_path(path, steps, packed.floats, packed.ints, centers, slack)
     assert slack.max() <= 0.625 * spacing + 1e-12  # what the reach of the worlds counts on
     centers = centers.transpose(0, 2, 1)
+    radius = np.asarray(arrays.sphere_radius)
     at_sample = 0
     for (qa, qb), count in zip(pairwise(path), steps, strict=True):
         for i in rng.choice(count, min(count, 4), replace=False):
@@ -241,8 +241,16 @@ def test_slack_covers_the_way_between_samples(seed, spacing):
             assert np.linalg.norm(centers[b] - centers[a], axis=1).max() <= spacing + 1e-9
             for t in np.linspace(i, i + 1, 23) / count:
                 here = sphere_positions(arrays, interpolate(robot, qa, qb, t))
-                near = np.linalg.norm(here - centers[a], axis=1) <= slack[a] + 1e-12
-                near |= np.linalg.norm(here - centers[b], axis=1) <= slack[b] + 1e-12
+                outward = rng.normal(size=(25, *here.shape))
+                outward[0] = centers[b] - centers[a]  # the way the sphere goes, and across it
+                outward[1:12] -= outward[0] * (
+                    (outward[1:12] * outward[0]).sum(axis=2, keepdims=True)
+                    / np.maximum((outward[0] ** 2).sum(axis=1, keepdims=True), 1e-300)
+                )
+                outward /= np.maximum(np.linalg.norm(outward, axis=2, keepdims=True), 1e-300)
+                rim = here + radius[:, None] * outward
+                near = np.linalg.norm(rim - centers[a], axis=2) <= radius + slack[a] + 1e-12
+                near |= np.linalg.norm(rim - centers[b], axis=2) <= radius + slack[b] + 1e-12
                 assert near.all()
         at_sample += count
 
@@ -522,7 +530,6 @@ def test_causes_are_ranked_and_confirmed(free_world, drawn, small):
                         sweep.centers[i, :, ball],
                         arrays.sphere_radius[ball] + sweep.slack[i, ball],
                         H,
-                        setting(checker).worlds.scale[0],
                         others,
                     )[s]
                     for ball in np.flatnonzero(arrays.sphere_link == link)
@@ -606,8 +613,7 @@ def test_validity_is_few_enough_worlds_and_nothing_certain(bounded, small, doubt
         assert all(isinstance(checker.is_valid(q), bool) for q in Q[:20])
         np.testing.assert_array_equal(checker.is_valid_batch(Q), singles)
         np.testing.assert_array_equal([checker.is_valid_buffer(q) for q in Q], singles)
-        scale = setting(checker).worlds.scale[0]
-        hits = np.array([ball_touches(drawn, q, RADIUS, H, scale).sum() for q in Q])
+        hits = np.array([ball_touches(drawn, q, RADIUS, H).sum() for q in Q])
         estimates = [checker.collision_probability(q) for q in Q]
         certain = np.array([e.certain for e in estimates])
         expected = ~certain & (hits <= checker._risk().allowed)

@@ -58,14 +58,13 @@ def test_joint_risk_does_not_depend_on_how_a_path_is_divided(runs):
 
 
 def test_products_and_sums_of_waypoints_measure_the_division(runs):
-    for x in uncertain(runs):
-        products = [1.0 - np.prod(1.0 - e.per_waypoint) for e in runs[x]]
-        sums = [e.per_waypoint.sum() for e in runs[x]]
-        for a, b in pairwise(products):
-            assert b > a + 0.02
-        for a, b in pairwise(sums):
-            assert b > 1.2 * a
-        assert products[-1] > 2.0 * runs[x][-1].probability
+    """Where the balls would just touch, many waypoints have a say, and each is counted anew."""
+    estimates = runs[0.06]
+    products = [1.0 - np.prod(1.0 - e.per_waypoint) for e in estimates]
+    sums = [e.per_waypoint.sum() for e in estimates]
+    assert all(b > a + 0.02 for a, b in pairwise(products))
+    assert all(b > 1.2 * a for a, b in pairwise(sums))
+    assert products[-1] > 2.0 * estimates[-1].probability
 
 
 def test_two_things_are_two_chances_and_the_largest_waypoint_is_too_low(two, runs):

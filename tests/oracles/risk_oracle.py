@@ -42,32 +42,13 @@ class DrawnVoxels:
         return bool(((center + radius < self.lower) | (center - radius > self.upper)).any())
 
 
-def ball_touches(owners_at, center, radius, resolution, steps, allowed=()):
-    """Draws (S,) in which a ball touches, with the rounding that `PosteriorWorlds` states.
-
-    An occupied voxel x counts as its inscribed ball. A draw touches unless one of the eight
-    nodes v around the centre c is farther from all of the draw's voxels than
-    r + 1/2 + |c - v| (voxels; distances rounded down to 1 / `steps`).
-    """
-    if owners_at.beyond(center, radius + 4 * resolution):
+def ball_touches(owners_at, center, radius, resolution, allowed=()):
+    """Draws (S,) that occupy a voxel whose centre is within radius + half a voxel of `center`."""
+    reach = radius + (0.5 + 1e-9) * resolution
+    if owners_at.beyond(center, reach):
         return np.zeros(owners_at.n_worlds, bool)
-    grid = center / resolution
-    low = np.floor(grid).astype(int)
-    need = radius / resolution + 0.5
-    wide = int(need) + 3
-    index = low + np.indices((2 * wide + 2,) * 3).reshape(3, -1).T - wide
-    index = index[np.linalg.norm(index - grid, axis=1) <= need + 2 * np.sqrt(3.0) + 0.2]
-    index = owners_at.occupiable(index)
-    counts = np.ones(256, bool)
-    counts[[0, *allowed]] = False
-    occupied = counts[owners_at(index)]
-    touched = np.ones(owners_at.n_worlds, bool)
-    for corner in np.indices((2, 2, 2)).reshape(3, -1).T:
-        node = low + corner
-        far = need + np.linalg.norm(grid - node)
-        away = np.linalg.norm(index - node, axis=1)
-        touched &= occupied[np.floor(steps * away) <= np.floor(steps * far)].any(axis=0)
-    return touched
+    index = inside_ball(center, reach, resolution)
+    return ~np.isin(owners_at(index), [0, *allowed]).all(axis=0)
 
 
 def inside_ball(center, radius, resolution):

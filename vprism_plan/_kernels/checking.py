@@ -691,11 +691,15 @@ def count_steps(P, rf, ri, spacing, steps):
 def place_path(P, steps, rf, ri, C, slack):
     """Sample a path: C (n, 3, S) sphere centres, and slack (n, S) that covers the gaps.
 
-    Between two samples a centre is nowhere farther than its slack from one of them: half
-    the chord, and a quarter of (joint angle turned) x (path length) for the bend. For the
-    second derivative of a centre along the edge is a sum over pairs of joints of
-    |dq_f| |dq_g| |dC/dq_g|, at most twice the product of the two, and a curve leaves its
-    chord by at most an eighth of that.
+    Grown by its slack, a sphere of radius r at one of two neighbouring samples holds every
+    point that it holds anywhere between them: sqrt(r^2 + chord^2 / 4) - r for the chord, and
+    a quarter of (joint angle turned) x (path length) for the bend.
+
+    The first, because a point within r of the chord, where that is divided into a and b, is
+    at a squared distance of at most r^2 + ab from one of its ends (the mean of the two
+    squares with weights b and a is that). The second, because the second derivative of a
+    centre along the edge is a sum over pairs of joints of |dq_f| |dq_g| |dC/dq_g|, at most
+    twice the product of the two, and a curve leaves its chord by at most an eighth of that.
     """
     dof = ri[4]
     q = np.empty(dof)
@@ -722,7 +726,8 @@ def place_path(P, steps, rf, ri, C, slack):
                     chord = 0.0
                     for k in range(3):
                         chord += (C[i + t, k, s] - C[i + t - 1, k, s]) ** 2
-                    way = 0.5 * np.sqrt(chord) + bend
+                    r = rf[ri[17] + 3 * ri[1] + s]
+                    way = np.sqrt(r * r + 0.25 * chord) - r + bend
                     slack[i + t - 1, s] = max(slack[i + t - 1, s], way)
                     slack[i + t, s] = max(slack[i + t, s], way)
         i += steps[e]

@@ -10,7 +10,7 @@ Tables (see `vprism_plan.world.posterior_worlds`):
     distance_row (g, ex, ey, ez) int32: row of `rows` per contact rule g; FREE beyond the
         reach of anything that any draw occupies, UNBAKED until somebody asks.
     rows (rows, S) uint8: floor(scale * distance to the nearest occupied voxel centre), or
-        NOTHING beyond the reach. lowest, highest (rows,): over the draws.
+        NOTHING beyond the reach. lowest (rows,): over the draws.
 """
 
 import numpy as np
@@ -121,86 +121,137 @@ def bake_block(owner_row, owners, counts, cx, cy, cz, reach, lut, wanted, out):
                     out[row, s] = lut[min(total[s], lut.size - 1)]
 
 
-# What a ball may be found to touch: nothing, what `hit` says, everything, or nobody knows yet.
-_NOTHING, _SOME, _ALL, _UNKNOWN = 0, 1, 2, -1
+# What a ball may be found to touch: nothing, what `hit` says, or nobody knows yet.
+_NOTHING, _SOME, _UNKNOWN = 0, 1, -1
+_RIM = 1e-9  # voxels; a centre on the rim of a ball is in it, however it rounds
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _touch_ball(  # noqa: PLR0911 (each return is a proof)
-    gx, gy, gz, ball, table, distance_row, rows, lowest, highest, scale, reach, hit
-):  # fmt: skip
-    """In which draws a ball touches something; fills hit (S,) only if the answer is `_SOME`.
+def _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach, hit):
+    """Bits of the draws that no node of the cell around a ball proves free of it.
 
-    gx, gy, gz: centre, in voxels of the table. ball: radius in voxels; every occupied voxel
-    counts as the ball inscribed in it.
-
-    A voxel centre x is within b = ball + 1/2 of c only if every node v of the cell around c
-    has |v - x| <= b + |c - v|: the draws for which no node proves the contrary touch.
+    A voxel centre x is within `need` of c only if every node v of the cell around c has
+    |v - x| <= need + |c - v|. Fills hit (S,) only if the answer is `_SOME`.
     """
     _, ex, ey, ez = distance_row.shape
     if not (0.0 <= gx <= ex - 1.0 and 0.0 <= gy <= ey - 1.0 and 0.0 <= gz <= ez - 1.0):
         return _NOTHING
-    x = min(int(gx), ex - 2)
-    y = min(int(gy), ey - 2)
-    z = min(int(gz), ez - 2)
-    need = ball + 0.5
     # The nearest node answers for most balls.
-    nx = int(gx + 0.5)
-    ny = int(gy + 0.5)
-    nz = int(gz + 0.5)
-    row = distance_row[table, nx, ny, nz]
+    x = int(gx + 0.5)
+    y = int(gy + 0.5)
+    z = int(gz + 0.5)
+    row = distance_row[table, x, y, z]
     if row < 0:
         return _UNKNOWN if row == UNBAKED else _NOTHING
-    away = need + np.sqrt((gx - nx) ** 2 + (gy - ny) ** 2 + (gz - nz) ** 2)
-    if away >= reach:
-        return _ALL  # farther than the table knows: never "free"
-    if lowest[row] > np.uint8(away * scale):
+    away = need + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+    if away < reach and lowest[row] > np.uint8(away * scale):
         return _NOTHING
-    every = True
+    hit[:] = 1
     for corner in range(8):
-        i = x + (corner >> 2)
-        j = y + ((corner >> 1) & 1)
-        k = z + (corner & 1)
-        row = distance_row[table, i, j, k]
+        x = min(int(gx), ex - 2) + (corner >> 2)
+        y = min(int(gy), ey - 2) + ((corner >> 1) & 1)
+        z = min(int(gz), ez - 2) + (corner & 1)
+        row = distance_row[table, x, y, z]
         if row < 0:
             return _UNKNOWN if row == UNBAKED else _NOTHING
-        away = need + np.sqrt((gx - i) ** 2 + (gy - j) ** 2 + (gz - k) ** 2)
-        if away >= reach:
-            continue
-        limit = np.uint8(away * scale)
-        if highest[row] <= limit:
-            continue
-        if lowest[row] > limit:
-            return _NOTHING
-        values = rows[row]
-        if every:
-            every = False
-            for s in range(hit.size):
-                hit[s] = np.uint8(values[s] <= limit)
-        else:
+        away = need + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+        if away < reach:  # the table knows no farther: never "free" for that
+            limit = np.uint8(away * scale)
+            if lowest[row] > limit:
+                return _NOTHING
+            values = rows[row]
             for s in range(hit.size):
                 hit[s] &= np.uint8(values[s] <= limit)
-    return _ALL if every else _SOME
+    return _SOME
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _mark_cell(gx, gy, gz, table, distance_row, wanted):
-    """Mark the blocks of the unbaked nodes of a cell."""
+def _must_touch(gx, gy, gz, need, table, distance_row, rows, scale, sure):
+    """Bits of the draws that some node of the cell proves to touch: |v - x| + |c - v| <= need."""
     _, ex, ey, ez = distance_row.shape
-    x = min(int(gx), ex - 2)
-    y = min(int(gy), ey - 2)
-    z = min(int(gz), ez - 2)
+    sure[:] = 0
     for corner in range(8):
-        i = x + (corner >> 2)
-        j = y + ((corner >> 1) & 1)
-        k = z + (corner & 1)
-        if distance_row[table, i, j, k] == UNBAKED:
-            wanted[table, i // BLOCK, j // BLOCK, k // BLOCK] = True
+        x = min(int(gx), ex - 2) + (corner >> 2)
+        y = min(int(gy), ey - 2) + ((corner >> 1) & 1)
+        z = min(int(gz), ez - 2) + (corner & 1)
+        left = need - np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+        # A stored distance is rounded down by less than one step.
+        limit = min(int(left * scale) - 1, 254)
+        if limit >= 0:
+            values = rows[distance_row[table, x, y, z]]
+            bound = np.uint8(limit)
+            for s in range(sure.size):
+                sure[s] |= np.uint8(values[s] <= bound)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _look(gx, gy, gz, need, table, distance_row, rows, lowest, sure):
+    """Add to sure (S,) the draws that occupy a voxel centre in the outer shell of a ball.
+
+    What lies deeper than two voxels in a ball is known from the nodes: they are less than
+    0.87 voxels off its centre. Returns `_UNKNOWN` at an unbaked voxel.
+    """
+    _, ex, ey, ez = distance_row.shape
+    outer = (need + _RIM) ** 2
+    inner = max(need - 2.0, 0.0) ** 2
+    for x in range(max(int(np.ceil(gx - need)), 0), min(int(gx + need) + 1, ex)):
+        for y in range(max(int(np.ceil(gy - need)), 0), min(int(gy + need) + 1, ey)):
+            flat = (gx - x) ** 2 + (gy - y) ** 2
+            if flat > outer:
+                continue
+            for z in range(max(int(np.ceil(gz - need)), 0), min(int(gz + need) + 1, ez)):
+                away = flat + (gz - z) ** 2
+                if inner <= away <= outer:
+                    row = distance_row[table, x, y, z]
+                    if row == UNBAKED:
+                        return _UNKNOWN
+                    if row >= 0 and lowest[row] == 0:
+                        values = rows[row]
+                        for s in range(sure.size):
+                            sure[s] |= np.uint8(values[s] == 0)
+    return _SOME
+
+
+@njit(cache=True, nogil=True)
+def _touch_ball(
+    gx, gy, gz, ball, table, distance_row, rows, lowest, scale, reach, hit, sure
+):  # fmt: skip
+    """In which draws a ball touches something; fills hit (S,) only if the answer is `_SOME`.
+
+    gx, gy, gz: centre, in voxels of the table. ball: radius in voxels; every occupied voxel
+    counts as the ball inscribed in it, so what counts is a voxel centre within ball + 1/2.
+    Exact: what the distances at the nodes around leave open is looked up voxel by voxel.
+    """
+    need = ball + 0.5
+    found = _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach, hit)
+    if found == _SOME:
+        _must_touch(gx, gy, gz, need, table, distance_row, rows, scale, sure)
+        open_draws = 0
+        for s in range(hit.size):
+            open_draws += hit[s] & (1 - sure[s])
+        if open_draws > 0:
+            found = _look(gx, gy, gz, need, table, distance_row, rows, lowest, sure)
+            if need >= reach:
+                sure[:] = 1  # farther than the table knows: never "free"
+        for s in range(hit.size):
+            hit[s] = sure[s]
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mark_ball(gx, gy, gz, ball, table, wanted):
+    """Mark the blocks that a ball, and the cell around its centre, reach."""
+    _, bx, by, bz = wanted.shape
+    wide = ball + 2.0
+    for i in range(max(int(gx - wide) // BLOCK, 0), min(int(gx + wide) // BLOCK + 1, bx)):
+        for j in range(max(int(gy - wide) // BLOCK, 0), min(int(gy + wide) // BLOCK + 1, by)):
+            for k in range(max(int(gz - wide) // BLOCK, 0), min(int(gz + wide) // BLOCK + 1, bz)):
+                wanted[table, i, j, k] = True
 
 
 @njit(cache=True, nogil=True)
 def touch(
-    C, slack, radii, tables, distance_row, rows, lowest, highest, first, spacing, scale, reach,
+    C, slack, radii, tables, distance_row, rows, lowest, first, spacing, scale, reach,
     touched, counts, first_sample, wanted,
 ):  # fmt: skip
     """In which draws a ball of any sample touches something; returns how many balls met an
@@ -216,6 +267,7 @@ def touch(
     n_draws = rows.shape[1]
     here = np.empty(n_draws, np.uint8)
     hit = np.empty(n_draws, np.uint8)
+    sure = np.empty(n_draws, np.uint8)
     missing = 0
     for i in range(C.shape[0]):
         here[:] = 0
@@ -228,18 +280,15 @@ def touch(
             gz = C[i, 2, j] / spacing - first[2]
             ball = (radii[j] + slack[i, j]) / spacing
             found = _touch_ball(
-                gx, gy, gz, ball, tables[j], distance_row, rows, lowest, highest, scale, reach, hit
+                gx, gy, gz, ball, tables[j], distance_row, rows, lowest, scale, reach, hit, sure
             )
             if found == _SOME:
                 some = True
                 for s in range(n_draws):
                     here[s] |= hit[s]
-            elif found == _ALL:
-                some = True
-                here[:] = 1
             elif found == _UNKNOWN:
                 missing += 1
-                _mark_cell(gx, gy, gz, tables[j], distance_row, wanted)
+                _mark_ball(gx, gy, gz, ball, tables[j], wanted)
         counts[i] = 0
         if some:
             total = 0
@@ -254,13 +303,12 @@ def touch(
 
 
 @njit(cache=True, nogil=True)
-def touch_one(
-    C, radii, tables, distance_row, rows, lowest, highest, first, spacing, scale, reach, touched
-):
+def touch_one(C, radii, tables, distance_row, rows, lowest, first, spacing, scale, reach, touched):
     """`touch` for one sample C (3, m) without slack: how many draws touch, or -1 if a voxel
     is unbaked. touched (S,) must be zero. Fewer arrays make a quicker call."""
     n_draws = rows.shape[1]
     hit = np.empty(n_draws, np.uint8)
+    sure = np.empty(n_draws, np.uint8)
     some = False
     for j in range(C.shape[1]):
         if tables[j] < 0:
@@ -269,15 +317,13 @@ def touch_one(
         gy = C[1, j] / spacing - first[1]
         gz = C[2, j] / spacing - first[2]
         found = _touch_ball(
-            gx, gy, gz, radii[j] / spacing, tables[j], distance_row, rows, lowest, highest, scale,
-            reach, hit,
+            gx, gy, gz, radii[j] / spacing, tables[j], distance_row, rows, lowest, scale, reach,
+            hit, sure,
         )  # fmt: skip
         if found == _SOME:
             some = True
             for s in range(n_draws):
                 touched[s] |= hit[s]
-        elif found == _ALL:
-            return n_draws
         elif found == _UNKNOWN:
             return -1
     total = 0
@@ -289,27 +335,27 @@ def touch_one(
 
 @njit(cache=True, nogil=True)
 def touch_each(
-    centers, radii, table, distance_row, rows, lowest, highest, first, spacing, scale, reach,
-    out, wanted,
+    centers, radii, table, distance_row, rows, lowest, first, spacing, scale, reach, out, wanted,
 ):  # fmt: skip
     """out (n, S): in which draws each ball (centers (n, 3), radii (n,)) touches something."""
     hit = np.empty(rows.shape[1], np.uint8)
+    sure = np.empty(rows.shape[1], np.uint8)
     missing = 0
     for i in range(centers.shape[0]):
         gx = centers[i, 0] / spacing - first[0]
         gy = centers[i, 1] / spacing - first[1]
         gz = centers[i, 2] / spacing - first[2]
         found = _touch_ball(
-            gx, gy, gz, radii[i] / spacing, table, distance_row, rows, lowest, highest, scale,
-            reach, hit,
+            gx, gy, gz, radii[i] / spacing, table, distance_row, rows, lowest, scale, reach,
+            hit, sure,
         )  # fmt: skip
-        out[i] = found == _ALL
+        out[i] = False
         if found == _SOME:
             for s in range(hit.size):
                 out[i, s] = hit[s] != 0
         elif found == _UNKNOWN:
             missing += 1
-            _mark_cell(gx, gy, gz, table, distance_row, wanted)
+            _mark_ball(gx, gy, gz, radii[i] / spacing, table, wanted)
     return missing
 
 
@@ -338,8 +384,8 @@ def causes(
             x = C[i, 0, j] / spacing - first[0]
             y = C[i, 1, j] / spacing - first[1]
             z = C[i, 2, j] / spacing - first[2]
-            ball = (radii[j] + slack[i, j]) / spacing + 0.5
-            wide = ball + 2.0  # what the nodes cannot rule out lies beyond by less than this
+            ball = (radii[j] + slack[i, j]) / spacing + 0.5 + _RIM
+            wide = ball
             for a in range(max(int(x - wide), 0), min(int(x + wide) + 2, nx)):
                 for b in range(max(int(y - wide), 0), min(int(y + wide) + 2, ny)):
                     flat = (a - x) ** 2 + (b - y) ** 2
@@ -350,7 +396,7 @@ def causes(
                         if row < 0:
                             continue
                         depth = ball - np.sqrt(flat + (c - z) ** 2)
-                        if depth < -2.0:
+                        if depth < 0.0:
                             continue
                         for s in mine:
                             if depth > deepest[s] and counts[tables[j], owners[row, s]]:

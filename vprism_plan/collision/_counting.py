@@ -63,7 +63,7 @@ def count_at(at: Setting, q: Float[np.ndarray, "dof"]) -> tuple[Float[np.ndarray
     tables, (scale, reach) = worlds.tables, worlds.scale
     hits = risk.touch_one(
         centers, at.radii, at.sphere_tables, tables.distance_row, tables.rows, tables.lowest,
-        tables.highest, worlds.first, worlds.resolution, scale, reach,
+        worlds.first, worlds.resolution, scale, reach,
         np.zeros(worlds.n_worlds, np.uint8),
     )  # fmt: skip
     if hits < 0:  # the first to ask here: bake, then count
@@ -85,7 +85,7 @@ def _touch(
         wanted = worlds.new_marks()
         missing = risk.touch(
             centers, slack, at.radii, at.sphere_tables, tables.distance_row, tables.rows,
-            tables.lowest, tables.highest, worlds.first, worlds.resolution, scale, reach,
+            tables.lowest, worlds.first, worlds.resolution, scale, reach,
             touched, counts, first, wanted,
         )  # fmt: skip
         if not missing:

@@ -106,7 +106,7 @@ def make_setting(
         ints=packed.ints,
         # Half a voxel: with a whole one, the room for the way between samples let layers of
         # voxels in and out as a path was divided differently.
-        spacing=0.5 * min(resolution, float(world.map.kernel_length)),
+        spacing=min(resolution, 0.5 * float(world.map.kernel_length)),
     )
 
 

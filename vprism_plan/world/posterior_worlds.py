@@ -28,7 +28,6 @@ class Tables:
     distance_row: Int32[np.ndarray, "g ex ey ez"]
     rows: UInt8[np.ndarray, "r s"]
     lowest: UInt8[np.ndarray, " r"]
-    highest: UInt8[np.ndarray, " r"]
 
 
 class PosteriorWorlds:
@@ -39,10 +38,10 @@ class PosteriorWorlds:
     holds everywhere, so what hides in one place is correlated with what hides next to it.
 
     Per voxel and draw one byte holds the distance to the nearest occupied voxel centre,
-    rounded down, so any ball is a comparison of S bytes at the nodes of the cell around its
-    centre, whatever its radius. An occupied voxel counts as the ball inscribed in it. What
-    the nodes cannot rule out is touched: an error is always to "touches", by at most 1.74
-    voxels, a tenth to a fifth of a voxel as a rule.
+    rounded down. A ball is compared with it at the nodes of the cell around its centre; what
+    they leave open is looked up voxel by voxel. An occupied voxel counts as the ball
+    inscribed in it: a draw is touched if the centre of a voxel it occupies is within
+    radius + resolution / 2 of a ball's centre.
 
     Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when
     the first ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the
@@ -119,7 +118,6 @@ class PosteriorWorlds:
             self._grown[None].copy(),
             np.empty((0, n_worlds), np.uint8),
             np.empty(0, np.uint8),
-            np.empty(0, np.uint8),
         )
         self._lock = threading.RLock()
 
@@ -145,7 +143,6 @@ class PosteriorWorlds:
         other._tables = Tables(
             np.repeat(self._grown[None], len(other._rules), axis=0),
             np.empty((0, self.n_worlds), np.uint8),
-            np.empty(0, np.uint8),
             np.empty(0, np.uint8),
         )
         other._lock = threading.RLock()
@@ -209,8 +206,7 @@ class PosteriorWorlds:
             wanted = self.new_marks()
             missing = kernels.touch_each(
                 centers, radii, rule, tables.distance_row, tables.rows, tables.lowest,
-                tables.highest, self.first, self.resolution, self._scale, self._reach,
-                out, wanted,
+                self.first, self.resolution, self._scale, self._reach, out, wanted,
             )  # fmt: skip
             if not missing:
                 return out
@@ -289,7 +285,7 @@ class PosteriorWorlds:
             if gone not in self._rules:
                 old = self._tables
                 rows = np.concatenate([old.distance_row, self._grown[None]])
-                self._tables = Tables(rows, old.rows, old.lowest, old.highest)
+                self._tables = Tables(rows, old.rows, old.lowest)
                 self._rules = [*self._rules, gone]
             return self._rules.index(gone)
 
@@ -392,7 +388,6 @@ class PosteriorWorlds:
                 updated,
                 np.concatenate([old.rows, fresh]),
                 np.concatenate([old.lowest, fresh.min(axis=1)]),
-                np.concatenate([old.highest, fresh.max(axis=1)]),
             )
 
     def _near_blocks(self, blocks: Int[np.ndarray, "b 3"]) -> Int[np.ndarray, " n"]:
