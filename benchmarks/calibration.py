@@ -82,12 +82,12 @@ def picture(voxels: VoxelCalibration, paths: PathCalibration, file: Path) -> Non
     left, right = figure.subplots(1, 2)
     curve(left, voxels.parts[1], "Occupancy of a voxel: occluded, supported", False)
     if paths.judged:
-        curve(right, paths.reliability(inside=True), "Joint collision probability of a path", True)
-        reported = paths.reliability()
+        curve(right, paths.reliability(), "Joint collision probability of a path", True)
+        centres = paths.reliability(inside=True)
         right.plot(
-            [r.predicted for r in reported.rows()],
-            [r.observed for r in reported.rows()],
-            color="#c05030", marker="s", label=f"rounded to the safe side, ECE {reported.ece:.3f}",
+            [r.predicted for r in centres.rows()],
+            [r.observed for r in centres.rows()],
+            color="#c05030", marker="s", label=f"voxel centres alone, ECE {centres.ece:.3f}",
         )  # fmt: skip
         right.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
     save_figure(figure, file)
@@ -149,18 +149,17 @@ def report(
         "space that the map cannot judge: a checker refuses those, and they are left out here. "
         f"Of the other {reported.n}, {100 * reported.mean_observed:.1f} % really collide.", "",
         "| joint probability | mean predicted | Brier | ECE |", "|---|---|---|---|",
-        f"| as reported (`touched`, errs to the safe side) | {reported.mean_predicted:.3f} "
-        f"| {reported.brier:.3f} | {reported.ece:.3f} |",
-        f"| as defined (an occupied voxel's centre inside) | {defined.mean_predicted:.3f} "
-        f"| {defined.brier:.3f} | {defined.ece:.3f} |", "",
+        "| as reported (an occupied voxel counts as the ball inscribed in it) "
+        f"| {reported.mean_predicted:.3f} | {reported.brier:.3f} | {reported.ece:.3f} |",
+        "| voxel centres alone (an occupied voxel's centre inside the sweep) "
+        f"| {defined.mean_predicted:.3f} | {defined.brier:.3f} | {defined.ece:.3f} |", "",
         f"Upper 95 % bound below 1 percent: {safe} paths, of which {collided} really "
         f"collide{share}.", "", "As reported:", "", table(reported), "",
-        "As defined:", "", table(defined), "",
+        "Voxel centres alone:", "", table(defined), "",
         f"Most sweeps are clear cases, and they make these errors small: only "
-        f"{sum(defined.counts[1:-1])} of {defined.n} lie between 0.1 and 0.9 as defined, "
-        f"{sum(reported.counts[1:-1])} as reported. Among those the figure as reported is too "
-        "high by design (a voxel's width of caution), and the figure as defined misses grazes "
-        "shallower than a voxel.", "",
+        f"{sum(defined.counts[1:-1])} of {defined.n} lie between 0.1 and 0.9 by centres, "
+        f"{sum(reported.counts[1:-1])} as reported. Voxel centres alone miss grazes shallower "
+        "than half a voxel; the figure as reported allows for them.", "",
     ]  # fmt: skip
     return "\n".join(out)
 

@@ -24,10 +24,9 @@ class PathCase:
     """One path: how many of the worlds object to it, and what the solids say.
 
     Attributes:
-        hits: worlds in which a ball of the sweep is reported to touch anything
-            (`PosteriorWorlds.touched`, which errs to "touches").
-        inside: worlds in which the centre of an occupied voxel lies inside the sweep: the
-            event as it is defined, without the rounding to the safe side.
+        hits: worlds in which a ball of the sweep touches anything (`PosteriorWorlds.touched`:
+            an occupied voxel counts as the ball inscribed in it).
+        inside: worlds in which the centre of an occupied voxel lies inside the sweep.
         n_worlds: of how many.
         distance: signed distance of the sweep to the nearest true solid, metres; the path
             collides where it is below 0.
@@ -54,7 +53,7 @@ class PathCalibration:
         return tuple(case for case in self.cases if not case.unsupported)
 
     def reliability(self, *, inside: bool = False) -> Reliability:
-        """Return the table of the judged paths, as reported or (`inside`) as defined."""
+        """Return the table of the judged paths, as reported or (`inside`) by voxel centres."""
         p = [(case.inside if inside else case.hits) / case.n_worlds for case in self.judged]
         return Reliability.of(np.array(p), np.array([c.distance < 0.0 for c in self.judged], bool))
 
