@@ -7,9 +7,9 @@ Everything is timed in one run, in turns, and the ratios of the medians are prin
 """
 
 import time
-from pathlib import Path
 
 import numpy as np
+from checking import demo_checker
 
 import vprism_plan as vp
 from vprism_plan.collision import compare
@@ -18,17 +18,6 @@ ROUNDS = 7
 CONFIGURATIONS = 100
 COMPARED = 2000
 STEP = 0.005  # metres between the configurations of a path
-
-
-def demo_checker() -> vp.CollisionChecker:
-    """The bundled scene with a Panda beside the clutter."""
-    observation = vp.load_observation(Path(vp.__file__).parent / "data" / "demo_scene")
-    world = vp.World(vp.fit_map(observation))
-    base = np.eye(4)
-    base[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    base[:3, 3] = [0.05, -0.6, 0.0]
-    urdf = Path(__file__).parent.parent / "urdf" / "panda.urdf"
-    return vp.CollisionChecker(world, vp.Robot.from_urdf(urdf, base_pose=base))
 
 
 def timed(call) -> tuple[float, object]:

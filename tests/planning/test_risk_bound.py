@@ -79,6 +79,16 @@ def test_if_no_bound_is_tight_enough_the_least_risky_path_is_shown_and_not_retur
     assert "whole path is not" in result.message
 
 
+def test_the_report_counts_every_tightening_also_those_that_made_it_worse():
+    """It once gave the level of the least risky path: 0 if tightening never helped."""
+    checker = risky(max_risk=0.1, first_risk=0.3, gain=0.9, levels=2)
+    result = plan(checker, START, GOAL)
+    assert result.status == "too_risky"
+    assert result.report.risk.probability == pytest.approx(0.3)
+    assert result.report.risk_levels == 2
+    assert "tightened 2 times" in result.message
+
+
 def test_a_refusal_of_the_tighter_search_keeps_the_path_that_was_found():
     checker = RiskyDisks(disk_world.wall_with_gap(), 0.1, 0.9, 1.0, 1)
     closed = disk_world.closed_wall()

@@ -15,8 +15,8 @@ from vprism_plan.world import PosteriorWorlds
 # Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
 PADDINGS = (0.5, 1.0, 2.0)
 # Voxels between a sphere's surface and the farthest voxel it is compared with: the way to
-# the far node of its centre's cell, half a voxel each for a voxel's own size and for the way
-# between samples, and room to spare.
+# the far node of its centre's cell, half a voxel for a voxel's own size, at most five eighths
+# for the way between samples, and room to spare.
 _ROOM = 3.0
 
 
@@ -104,8 +104,6 @@ def make_setting(
         packed=(baked.distance, baked.blocks, baked.floats),
         floats=packed.floats,
         ints=packed.ints,
-        # Half a voxel: with a whole one, the room for the way between samples let layers of
-        # voxels in and out as a path was divided differently.
         spacing=min(resolution, 0.5 * float(world.map.kernel_length)),
     )
 

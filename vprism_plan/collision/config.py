@@ -24,7 +24,8 @@ class CheckerConfig:
             is the tolerance of `check_motion`.
         max_risk: Bound on the probability of collision. With a bound, the objects of the
             map (and occluded space where the map has support) are judged by worlds drawn
-            from its posterior instead of by the level set: a configuration or an edge is
+            from its posterior instead of by the level set, at P(occupied) = 1/2 of each
+            draw whatever `WorldConfig.level` is: a configuration or an edge is
             free if the upper confidence bound of its probability of coming within `margin`
             is at most `max_risk`. Everything else is refused as without a bound. None: level set.
         allowed_contacts: Link or SRDF group -> ids of the objects it may touch; for

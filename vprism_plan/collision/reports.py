@@ -101,7 +101,8 @@ class StateReport:
 
     Attributes:
         valid: The verdict; `contacts` is never empty when it is False.
-        contacts: Reasons, deepest first, one per link and touched body.
+        contacts: Reasons, deepest first, one per link and touched body; what `max_risk`
+            refuses comes last.
         clearance: Lower bound of the distance to the world, metres; nan if q is not finite.
         self_clearance: Smallest gap between links that may collide, metres; inf if none.
         margin: Clearance that was required, metres.

@@ -34,15 +34,17 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
         return attempt(checker, time_limit, 0)
     began = time.perf_counter()
     best: PlanResult | None = None
-    level, spent = 0, 0.0
+    level, tried, spent = 0, 0, 0.0
     current: Any = checker
     while current is not None:
         left = time_limit - (time.perf_counter() - began - spent)
         if level > 0 and left <= 0.0:
             break
-        result = attempt(current, left if level else time_limit, level)
+        result, tried = attempt(current, left if level else time_limit, level), level
         if not result.solved:
-            return best or result
+            if best is None:
+                return result
+            break
         asked = time.perf_counter()
         risk = checker.collision_probability(result.path, held_out=True)
         spent += time.perf_counter() - asked
@@ -50,21 +52,22 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
         if risk.upper <= checker.max_risk:
             return replace(result, report=report, message=f"{result.message}; {risk.text()}")
         if best is None or risk.upper < best.report.risk.upper:
-            best = _too_risky(replace(result, report=report), checker.max_risk)
+            best = replace(result, report=report)
         level += 1
         current = checker.tightened(level)
     assert best is not None
-    return best
+    return _too_risky(best, tried, spent, checker.max_risk)
 
 
-def _too_risky(result: PlanResult, max_risk: float) -> PlanResult:
+def _too_risky(best: PlanResult, tried: int, spent: float, max_risk: float) -> PlanResult:
     return replace(
-        result,
+        best,
         path=None,
-        approximate_path=result.path,
+        approximate_path=best.path,
         status="too_risky",
-        message=f"every edge is within max_risk {max_risk:g}, the whole path is not, with the "
-        f"bound tightened {result.report.risk_levels} times: {result.report.risk.text()}",
+        report=replace(best.report, risk_levels=tried, risk_time=spent),
+        message=f"every edge is within max_risk {max_risk:g}, the whole path is not; the least "
+        f"risky one, with the bound tightened {tried} times: {best.report.risk.text()}",
     )
 
 
