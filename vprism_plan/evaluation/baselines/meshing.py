@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Surfaces of the objects that any method reconstructs, by marching cubes."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.protocols import Reconstruction
+from vprism_plan.world.config import check_level
+from vprism_plan.world.meshes import surface
+
+if TYPE_CHECKING:
+    import trimesh
+
+_CHUNK = 1 << 16
+_MAX_NODES = 20_000_000
+
+
+def meshes_of(
+    reconstruction: Reconstruction,
+    level: float = 0.5,
+    resolution: float = 0.01,
+    *,
+    bounds: Any = None,
+) -> "dict[int, trimesh.Trimesh]":
+    """Return the watertight surface of {x : P(object k | x) >= level} of every object, metres.
+
+    Nodes are whole multiples of `resolution`, world frame. Sets that leave the box are
+    closed at its sides. An object that reaches the level at no node is left out.
+
+    Args:
+        reconstruction: of any method.
+        level: probability in (0, 1).
+        resolution: edge of the marching cubes, m.
+        bounds: (2, 3) corners of the box to look in, m; None asks the reconstruction's own
+            `support_bounds()`.
+
+    Raises:
+        ConfigError: level, resolution or bounds cannot be used.
+        WorldError: a surface could not be closed.
+    """
+    check_level(level)
+    if not 1e-4 <= resolution <= 1.0:
+        raise ConfigError(f"resolution is {resolution}; it must be between 0.0001 and 1 metres")
+    lower, upper = _box(reconstruction, bounds)
+    first = np.floor(lower / resolution).astype(np.int64) - 1
+    shape = np.ceil(upper / resolution).astype(np.int64) + 2 - first
+    count = math.prod(int(n) for n in shape)
+    if count > _MAX_NODES:
+        raise ConfigError(
+            f"resolution {resolution} m gives {count:,} samples (at most {_MAX_NODES:,}); "
+            "use a coarser one"
+        )
+    probabilities = _sample(reconstruction, first, shape, resolution)
+    found = {}
+    for k, object_id in enumerate(reconstruction.object_ids, start=1):
+        mesh = surface(probabilities[..., k] - np.float32(level), resolution * first, resolution)
+        if mesh is not None:
+            found[int(object_id)] = mesh
+    return found
+
+
+def _box(
+    reconstruction: Reconstruction, bounds: Any
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Return the corners of the box to look in."""
+    if bounds is None:
+        own = getattr(reconstruction, "support_bounds", None)
+        if own is None:
+            raise ConfigError(
+                f"a {type(reconstruction).__name__} does not say where it may be occupied; "
+                "pass bounds=((x, y, z), (x, y, z)) in metres"
+            )
+        bounds = own()
+    box = np.asarray(bounds, dtype=np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
+        raise ConfigError(
+            f"bounds is {bounds!r}; it must be ((x, y, z), (x, y, z)) in metres, finite, "
+            "with every lower coordinate below the upper one"
+        )
+    return box[0], box[1]
+
+
+def _sample(
+    reconstruction: Reconstruction, first: np.ndarray, shape: np.ndarray, resolution: float
+) -> Float[np.ndarray, "nx ny nz k"]:
+    """Probabilities at the nodes, empty in the outermost layer."""
+    classes = len(reconstruction.object_ids) + 1
+    probabilities = np.zeros((*shape, classes), dtype=np.float32)
+    probabilities[..., 0] = 1.0
+    inner = np.moveaxis(np.indices(tuple(shape - 2)), 0, -1).reshape(-1, 3) + 1
+    values = np.empty((len(inner), classes), dtype=np.float32)
+    for start in range(0, len(inner), _CHUNK):
+        points = resolution * (inner[start : start + _CHUNK] + first).astype(np.float64)
+        values[start : start + _CHUNK] = reconstruction.predict_proba(points)
+    probabilities[1:-1, 1:-1, 1:-1] = values.reshape(*(shape - 2), classes)
+    return probabilities

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The network: a PointConv encoder of a partial cloud, and a head that answers query points.
+
+PointSDF (Van der Merwe et al. 2020, arXiv 1910.00983) embeds a partial cloud by four PointConv
+layers (Wu, Qi and Fuxin 2019, arXiv 1811.07246) and lets a fully connected network map the
+embedding and a query point to a signed distance, with a skip connection half way. Here, as in
+the comparison of V-PRISM, a sigmoid comes last and the answer is the probability that the query
+lies inside. This one is sized for a CPU: three PointConv layers, the last over the whole cloud,
+and layer normalisation, which unlike the original's batch normalisation answers an object the
+same whatever stands beside it.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.baselines.pointsdf.cloud import CONTEXT
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of the network.
+
+    Attributes:
+        cloud: points that an object is given by.
+        centers: points that the first and the second layer keep.
+        neighbours: that a centre sees in each of them.
+        features: of the first, second and last layer.
+        kernels: functions of the relative position that weigh the neighbours.
+        width: of the head's layers.
+        depth: number of the head's layers before the last; the input enters again half way.
+        bandwidths: of the density estimate of each layer, in the network's coordinates.
+    """
+
+    cloud: int = 256
+    centers: tuple[int, int] = (96, 24)
+    neighbours: int = 16
+    features: tuple[int, int, int] = (48, 96, 128)
+    kernels: int = 8
+    width: int = 128
+    depth: int = 6
+    bandwidths: tuple[float, float, float] = (0.1, 0.2, 0.4)
+
+    def __post_init__(self) -> None:
+        first, second = self.centers
+        if not self.cloud >= first >= second >= 1 or not 1 <= self.neighbours <= second:
+            raise ConfigError(
+                f"cloud {self.cloud}, centers {self.centers}, neighbours {self.neighbours}: each "
+                "layer must keep at most the points before it and see at most those it is given"
+            )
+        if self.depth < 2:
+            raise ConfigError(f"depth is {self.depth}; the head needs at least 2 layers")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all sizes, ready for JSON; `from_dict` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Rebuild from `to_dict`, also after JSON made lists of tuples."""
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+
+
+class PointConv(nn.Module):
+    """A convolution over a point set whose weights are functions of relative position.
+
+    Of the neighbours k of a centre, with lifted features h_k, inverse densities s_k and
+    weights w_k = W(x_k - x), the outer products s_k h_k w_k^T are summed and mapped linearly:
+    the reordered form of the convolution in section 3.2 of Wu et al., which needs no weight
+    matrix per neighbour.
+
+    The centres are the first `centers` points given: they come farthest first, so that these
+    are what farthest point sampling would choose. None: one centre, at the origin, that
+    sees everything.
+    """
+
+    def __init__(
+        self,
+        features: int,
+        out: int,
+        *,
+        centers: int | None,
+        neighbours: int,
+        kernels: int,
+        bandwidth: float,
+    ) -> None:
+        super().__init__()
+        self.centers, self.neighbours, self.bandwidth = centers, neighbours, bandwidth
+        hidden = max(32, (features + out) // 3)
+        self.lift = nn.Sequential(nn.Linear(3 + features, hidden), nn.ReLU())
+        self.weigh = nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, kernels), nn.ReLU())
+        self.dense = nn.Sequential(nn.Linear(1, 8), nn.ReLU(), nn.Linear(8, 1), nn.Sigmoid())
+        self.mix = nn.Linear(hidden * kernels, out)
+        self.norm = nn.LayerNorm(out)
+
+    def forward(
+        self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n f"]
+    ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m out"]]:
+        """Return the centres and their features."""
+        sparse = self._inverse_density(points)
+        if self.centers is None:
+            centers = points.new_zeros(len(points), 1, 3)
+            offset, seen = points[:, None], torch.cat([points, features], -1)[:, None]
+            sparse = sparse[:, None]
+        else:
+            centers = points[:, : self.centers]
+            index = nearest(centers, points, self.neighbours)
+            offset = gather(points, index) - centers[:, :, None]
+            seen = torch.cat([offset, gather(features, index)], -1)
+            sparse = gather(sparse, index)
+        # Relative to the sparsest neighbour, as only differences between neighbours matter.
+        sparse = sparse / sparse.amax(dim=2, keepdim=True)
+        lifted = self.lift(seen) * self.dense(sparse)
+        kernel = self.weigh(offset / self._reach(offset))
+        outer = torch.einsum("bmkc,bmkw->bmcw", lifted, kernel) / lifted.shape[2]
+        return centers, torch.relu(self.norm(self.mix(outer.flatten(2))))
+
+    def _inverse_density(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 1"]:
+        """One over a Gaussian kernel density estimate (up to a constant factor)."""
+        square = distances(points, points).square()
+        # Below exp(-20) nothing counts, and subnormal numbers are slow.
+        density = torch.exp((square / (-2.0 * self.bandwidth**2)).clamp_min(-20.0)).mean(dim=2)
+        return (1.0 / density)[..., None]
+
+    @staticmethod
+    def _reach(offset: Float[Tensor, "b m k 3"]) -> Float[Tensor, "b 1 1 1"]:
+        """Typical distance of a cloud's neighbours: the weights' unit of length."""
+        return offset.square().sum(-1).mean(dim=(1, 2)).sqrt().clamp_min(1e-3)[:, None, None, None]
+
+
+class PointSDF(nn.Module):
+    """Partial cloud and query points in, logit of "inside" out."""
+
+    def __init__(self, architecture: Architecture | None = None) -> None:
+        super().__init__()
+        a = architecture or Architecture()
+        self.architecture = a
+        given = (4, a.features[0], a.features[1])
+        self.encoder = nn.ModuleList(
+            PointConv(
+                given[i], a.features[i], centers=(*a.centers, None)[i],
+                neighbours=a.neighbours, kernels=a.kernels, bandwidth=a.bandwidths[i],
+            )
+            for i in range(3)
+        )  # fmt: skip
+        half = a.width // 2
+        self.query = nn.Sequential(nn.Linear(4, half), nn.ReLU(), nn.Linear(half, half), nn.ReLU())
+        self.cloud_in = nn.Linear(a.features[2] + CONTEXT, a.width)
+        self.query_in = nn.Linear(half, a.width, bias=False)
+        self.cloud_skip = nn.Linear(a.features[2] + CONTEXT, a.width)
+        self.query_skip = nn.Linear(half, a.width, bias=False)
+        self.layers = nn.ModuleList(nn.Linear(a.width, a.width) for _ in range(a.depth - 1))
+        self.last = nn.Linear(a.width, 1)
+
+    def embed(
+        self, cloud: Float[Tensor, "b n 3"], context: Float[Tensor, "b c"]
+    ) -> Float[Tensor, "b e"]:
+        """Return the embedding of clouds in their normalised frame, farthest point first."""
+        points, features = cloud, with_height(cloud, context)
+        for layer in self.encoder:
+            points, features = layer(points, features)
+        return torch.cat([features[:, 0], context], dim=-1)
+
+    def answer(
+        self, embedding: Float[Tensor, "b e"], queries: Float[Tensor, "b q 3"]
+    ) -> Float[Tensor, "b q"]:
+        """Return the logit that each query (normalised frame) lies inside its object."""
+        context = embedding[:, -CONTEXT:]
+        asked = self.query(with_height(queries, context))
+        # The first layer of [embedding, query] in two parts: the embedding's once per object.
+        x = torch.relu(self.query_in(asked) + self.cloud_in(embedding)[:, None])
+        for i, layer in enumerate(self.layers):
+            x = layer(x)
+            if i == len(self.layers) // 2:
+                x = x + self.query_skip(asked) + self.cloud_skip(embedding)[:, None]
+            x = torch.relu(x)
+        return self.last(x)[..., 0]
+
+    def forward(
+        self,
+        cloud: Float[Tensor, "b n 3"],
+        context: Float[Tensor, "b c"],
+        queries: Float[Tensor, "b q 3"],
+    ) -> Float[Tensor, "b q"]:
+        """Embed and answer."""
+        return self.answer(self.embed(cloud, context), queries)
+
+
+def with_height(
+    points: Float[Tensor, "b n 3"], context: Float[Tensor, "b c"]
+) -> Float[Tensor, "b n 4"]:
+    """Append each point's height above the table, in units of the cloud's scale."""
+    return torch.cat([points, points[..., 2:] + context[:, None, 1:2]], dim=-1)
+
+
+def distances(a: Float[Tensor, "b m 3"], b: Float[Tensor, "b n 3"]) -> Float[Tensor, "b m n"]:
+    """Distances by differences: exactly zero for duplicates, unlike the expanded square."""
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def nearest(a: Float[Tensor, "b m 3"], b: Float[Tensor, "b n 3"], k: int) -> Tensor:
+    """Indices (b, m, k) of the k points of `b` nearest to each of `a`."""
+    with torch.no_grad():
+        return distances(a, b).topk(k, dim=2, largest=False, sorted=False).indices
+
+
+def gather(values: Float[Tensor, "b n f"], index: Tensor) -> Float[Tensor, "b m k f"]:
+    """Return values[b, index[b, m, k]]."""
+    rows = torch.arange(len(values))[:, None, None]
+    return values[rows, index]
