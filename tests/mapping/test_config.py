@@ -34,6 +34,7 @@ def test_paper_holds_table_three():
         ("bias_variance", float("inf")), ("hinge_shift", (0.0, 1.0)),
         ("hinge_shift", (0.0, 0.0, float("nan"))), ("prior_logit_variance", None),
         ("prior_weight_variance", 100.0), ("max_points", 0), ("ray_step", "10cm"),
+        ("ray_sampling", "stratify"), ("object_resolution", 0.0), ("empty_resolution", -0.01),
     ],
 )  # fmt: skip
 def test_an_invalid_value_is_named(name, value):

@@ -63,6 +63,44 @@ def test_ray_samples_are_uniform_within_their_stratum():
     assert (np.abs(histogram - 2000) < 250).all()
 
 
+@given(seed=SEEDS, radius=st.floats(0.02, 0.6), step=st.floats(0.01, 0.4))
+def test_steps_are_the_near_ends_of_all_strata_near_an_object(seed, radius, step):
+    rng = np.random.default_rng(seed)
+    origin = rng.normal(size=3)
+    points = origin + rng.normal(size=(4, 3))
+    centers = points[:2] + 0.3 * rng.normal(size=(2, 3))
+    samples = sample_rays(points, origin, centers, radius, step, rng, "steps")
+    expected = []
+    for point in points:
+        length = np.linalg.norm(point - origin)
+        for t in np.arange(0.0, length, step):
+            at = origin + t * (point - origin) / length
+            gap = np.linalg.norm(at - centers, axis=1).min()
+            if gap <= radius - 1e-9:
+                expected.append(at)
+            else:
+                assert gap > radius + 1e-9  # not a case that rounding decides
+    np.testing.assert_allclose(samples, np.array(expected).reshape(-1, 3), atol=1e-9)
+
+
+def test_whole_rays_are_sampled_evenly_wherever_the_objects_are():
+    origin, surface = np.ones(3), np.tile([[1.0, 1.0, 3.0]], (20000, 1))
+    nowhere = np.full((1, 3), -9.0)
+    samples = sample_rays(surface, origin, nowhere, 0.1, 0.1, np.random.default_rng(1), "whole")
+    assert samples.shape == (20000, 3)
+    np.testing.assert_array_equal(samples[:, :2], 1.0)
+    histogram, _ = np.histogram(samples[:, 2], bins=10, range=(1.0, 3.0))
+    assert histogram.sum() == 20000
+    assert (np.abs(histogram - 2000) < 250).all()
+
+
+def test_without_a_resolution_every_point_stays():
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    kept = grid_subsample(points, None)
+    np.testing.assert_array_equal(kept, points)
+    assert kept is not points
+
+
 def test_no_ray_passes_the_object():
     rng = np.random.default_rng(0)
     far = sample_rays(np.ones((5, 3)), np.zeros(3), np.full((1, 3), -9.0), 0.2, 0.1, rng)

@@ -4,8 +4,11 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Literal, get_args
 
 from vprism_plan.errors import ConfigError
+
+RaySampling = Literal["stratified", "steps", "whole"]
 
 
 def _finite(value: object) -> bool:
@@ -44,6 +47,10 @@ _RULES: dict[str, tuple[str, Callable]] = {
     "prior_occupancy": _PROBABILITY,
     "object_radius": _POSITIVE,
     "ray_step": _POSITIVE,
+    "ray_sampling": (
+        "one of " + ", ".join(map(repr, get_args(RaySampling))),
+        lambda v: v in get_args(RaySampling),
+    ),
     "below_plane_samples": _whole(0),
     "below_plane_margin": _NON_NEGATIVE,
     "object_resolution": _POSITIVE,
@@ -55,7 +62,7 @@ _RULES: dict[str, tuple[str, Callable]] = {
 }
 _OPTIONAL = frozenset(
     {"hinge_depth", "prior_logit_variance", "prior_weight_variance", "prior_occupancy"}
-    | {"front_distance"}
+    | {"front_distance", "object_resolution", "empty_resolution"}
 )
 
 
@@ -114,10 +121,14 @@ class MapConfig:
     Negative samples
         object_radius: r_obj, m; negatives are kept this near an object's box centre.
         ray_step: length of a stratum along a camera ray, m; one sample in each.
+        ray_sampling: "stratified" draws each sample anywhere in its stratum. The others
+            are what the paper compares with: "steps" puts it at the near end of the
+            stratum, the same for every ray; "whole" draws one per ray, anywhere between
+            camera and surface, near an object or not (as Bayesian Hilbert maps do).
         below_plane_samples: samples in the ball of r_obj around each box centre, of
             which those under the plane are kept.
         below_plane_margin: "under" means at least this far below the plane, m.
-        object_resolution, empty_resolution: grid subsampling per label, m.
+        object_resolution, empty_resolution: grid subsampling per label, m; None for none.
         front_distance: extra negatives this far in front of each observed object
             point, m; None for none (the paper).
         front_resolution: grid that thins those, m.
@@ -145,10 +156,11 @@ class MapConfig:
     prior_occupancy: float | None = 0.2
     object_radius: float = 0.25
     ray_step: float = 0.1
+    ray_sampling: RaySampling = "stratified"
     below_plane_samples: int = 4000
     below_plane_margin: float = 0.0
-    object_resolution: float = 0.01
-    empty_resolution: float = 0.015
+    object_resolution: float | None = 0.01
+    empty_resolution: float | None = 0.015
     front_distance: float | None = 0.005
     front_resolution: float = 0.01
     max_points: int = 150_000

@@ -122,9 +122,10 @@ def training_data(
         origin = view.camera_center
         empty.append(
             negatives.sample_rays(
-                cloud, origin, centers, config.object_radius, config.ray_step, rng
+                cloud, origin, centers, config.object_radius, config.ray_step, rng,
+                config.ray_sampling,
             )
-        )
+        )  # fmt: skip
         if config.front_distance is not None:
             seen = negatives.sample_in_front(cloud[label > 0], origin, config.front_distance)
             front.append(grid_subsample(seen, config.front_resolution))
@@ -134,7 +135,9 @@ def training_data(
             config.below_plane_samples, rng, config.below_plane_margin,
         )
     )  # fmt: skip
-    near = _near_any(np.concatenate(empty), centers, config.object_radius)
+    near = np.concatenate(empty)
+    if config.ray_sampling != "whole":
+        near = _near_any(near, centers, config.object_radius)
     free = np.concatenate([grid_subsample(near, config.empty_resolution), *front])
     surfaces = [grid_subsample(points[labels == i], config.object_resolution) for i in object_ids]
     counts = [len(s) for s in surfaces]

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan._kernels import mapping as kernels
+from vprism_plan.mapping.config import RaySampling
 
 
 def box_centers(
@@ -34,20 +35,28 @@ def sample_rays(
     radius: float,
     step: float,
     rng: np.random.Generator,
+    sampling: RaySampling = "stratified",
 ) -> Float[np.ndarray, "m 3"]:
-    """Stratified uniform samples on the rays from `origin` to every point.
+    """Samples on the rays from `origin` to every point, by default stratified uniform ones.
 
     Each ray is cut into strata of length `step` (m) from the camera on, the last one
     ending at the surface; every stratum gives one uniform sample, kept if it is within
     `radius` (m) of a centre. Background rays pass objects too, and count.
+
+    `sampling` "steps" takes each stratum's near end instead; "whole" one uniform sample
+    of every whole ray, wherever the objects are.
     """
     if len(points) == 0 or len(centers) == 0:
         return np.zeros((0, 3))
+    if sampling == "whole":
+        return np.asarray(origin + rng.random((len(points), 1)) * (points - origin))
     first, count = kernels.ray_strata(points, origin, centers, radius, step)
     most = int(count.max(initial=0))
     if most == 0:
         return np.zeros((0, 3))
-    uniform = rng.random((len(points), most))
+    uniform = np.zeros((len(points), most))
+    if sampling == "stratified":
+        uniform = rng.random((len(points), most))
     samples, keep = kernels.ray_samples(
         points, origin, centers, radius, step, first, count, uniform
     )

@@ -7,13 +7,16 @@ from jaxtyping import Float
 from vprism_plan.errors import MapError
 
 
-def grid_subsample(points: Float[np.ndarray, "n 3"], resolution: float) -> Float[np.ndarray, "m 3"]:
+def grid_subsample(
+    points: Float[np.ndarray, "n 3"], resolution: float | None
+) -> Float[np.ndarray, "m 3"]:
     """Return the barycentre of the points in each occupied cell of `resolution` (m).
 
     Cells sit at world multiples of the resolution; the result is ordered by cell, so
-    it does not depend on the order of the points but for rounding in the sums.
+    it does not depend on the order of the points but for rounding in the sums. A
+    resolution of None keeps every point.
     """
-    if len(points) == 0:
+    if len(points) == 0 or resolution is None:
         return points.copy()
     cells = np.floor(points / resolution)
     lower = cells.min(axis=0)

@@ -30,6 +30,19 @@ METHODS: dict[str, Method] = {
         _method("vprism", "V-PRISM (ours)", "maps", "fit_default"),
         _method("vprism-fine", "V-PRISM (ours, fine)", "maps", "fit_fine"),
         _method("vprism-paper", "V-PRISM (paper)", "maps", "fit_paper"),
+        _method("bhm-sampling", "V-PRISM (paper) with BHM sampling", "maps", "fit_bhm_sampling"),
+        _method(
+            "no-under-table",
+            "V-PRISM (paper) without under the table",
+            "maps",
+            "fit_no_under_table",
+        ),
+        _method(
+            "no-stratified",
+            "V-PRISM (paper) without stratified sampling",
+            "maps",
+            "fit_no_stratified",
+        ),
         _method("voxel", "Voxel", "voxel", continuous=False, uncertainty=False),
     )
 }
