@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int
 
+from vprism_plan.evaluation._imaging import sense, table_depth
 from vprism_plan.evaluation._placement import gather, random_camera, random_solid, upright
 from vprism_plan.evaluation.camera import Camera, DepthNoise
 from vprism_plan.evaluation.solids import Box, Capsule, Frustum, Solid, cylinder, sphere
@@ -19,23 +20,6 @@ from vprism_plan.perception.observation import Observation
 
 if TYPE_CHECKING:
     import trimesh
-
-MAX_RANGE = 3.0  # metres of depth beyond which the simulated sensor reports nothing
-_PALETTE = np.array(
-    [
-        [178, 176, 170],  # label 0: table and clutter
-        [214, 96, 77],
-        [67, 147, 195],
-        [90, 174, 97],
-        [227, 170, 60],
-        [153, 112, 171],
-        [80, 190, 190],
-        [200, 120, 160],
-        [150, 140, 70],
-        [110, 110, 200],
-        [230, 140, 100],
-    ]
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +97,7 @@ def render(
     directions = camera.ray_directions()
     shape = directions.shape[:2]
     depth = np.full(shape, np.inf)
-    with np.errstate(divide="ignore"):
-        table = -camera.center[2] / directions[..., 2]
-    depth = np.where(table > 0, table, np.inf)
+    depth = table_depth(camera, directions)
     labels = np.zeros(shape, dtype=np.int32)
     hit = np.full(shape, -1)
     for index, (solid, label) in enumerate(zip(scene.solids, scene.labels, strict=True)):
@@ -134,12 +116,7 @@ def render(
         mask = hit == index
         points = camera.center + depth[mask][:, None] * directions[mask]
         normals[mask] = solid.normals(points)
-    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    cosine = np.abs((unit * normals).sum(-1))
-    depth[depth > MAX_RANGE] = 0.0
-    color = _shade(hit, labels, normals, depth)
-    if noise is not None:
-        depth = noise.apply(depth, cosine, 1.0 / camera.intrinsics[0, 0], seed)
+    depth, color = sense(camera, directions, depth, normals, labels, hit, noise, seed)
     return Observation(
         depth.astype(np.float32),
         labels,
@@ -147,18 +124,6 @@ def render(
         camera.T_world_camera.copy(),
         color=color,
     )
-
-
-def _shade(
-    hit: np.ndarray, labels: np.ndarray, normals: np.ndarray, depth: np.ndarray
-) -> np.ndarray:
-    """Lambert shading with one light from above, one palette colour per object."""
-    light = np.array([0.35, -0.25, 0.9])
-    intensity = 0.45 + 0.55 * np.clip(normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
-    base = _PALETTE[np.where(labels > 0, (labels - 1) % (len(_PALETTE) - 1) + 1, 0)].astype(float)
-    base[(hit >= 0) & (labels == 0)] = (120, 110, 100)
-    base[depth == 0] = 60
-    return np.clip(base * intensity[..., None], 0, 255).astype(np.uint8)
 
 
 def random_scene(
