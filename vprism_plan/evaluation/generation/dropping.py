@@ -16,6 +16,8 @@ from vprism_plan.evaluation.generation.shapes import Shape
 _DENSITY = 400.0  # kg/m^3, of the hulls
 _TIME_STEP = 0.002  # seconds
 _TIME_LIMIT = 8.0  # seconds until every object must rest
+_GATHERING = 0.8  # seconds from the start during which everything is drawn together
+_PULL = 6.0  # m/s^2 towards the middle meanwhile
 _CALM = 0.3  # seconds that it must rest
 _CHUNK = 25  # steps between looks
 _SLOW = (0.002, 0.02)  # m/s and rad/s that count as rest
@@ -77,7 +79,7 @@ def _compile(mujoco: Any, shapes: list[Shape]) -> Any:
     # has them, MuJoCo 3 only where asked.
     if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_MULTICCD
-    contact = {"condim": 6, "friction": [0.7, 0.005, 0.001], "solref": [0.01, 1.0]}
+    contact = {"condim": 6, "friction": [0.5, 0.005, 0.001], "solref": [0.01, 1.0]}
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **contact)
     for index, shape in enumerate(shapes):
         corners = np.ascontiguousarray(shape.vertices[shape.hull])
@@ -134,6 +136,7 @@ def _settle(mujoco: Any, model: Any, data: Any) -> bool:
     """Step until everything has been slow for a while; whether that happened in time."""
     calm = 0.0
     while data.time < _TIME_LIMIT:
+        data.xfrc_applied[1:, :2] = _pull(model, data) if data.time < _GATHERING else 0.0
         mujoco.mj_step(model, data, _CHUNK)
         speed = data.qvel.reshape(-1, 6)
         still = (
@@ -146,6 +149,13 @@ def _settle(mujoco: Any, model: Any, data: Any) -> bool:
         if np.linalg.norm(data.qpos.reshape(-1, 7)[:, :2], axis=1).max() > 4 * _REGION:
             return False
     return False
+
+
+def _pull(model: Any, data: Any) -> np.ndarray:
+    """Return horizontal forces (n, 2) towards the middle, fading within its last 3 cm."""
+    away = data.xipos[1:, :2]
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    return np.asarray(-_PULL * model.body_mass[1:, None] * away / np.maximum(distance, 0.03))
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
