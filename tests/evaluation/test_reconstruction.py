@@ -202,13 +202,13 @@ def test_surface_points_lie_on_the_surface_evenly_and_repeat():
 
 @settings(max_examples=20)
 @given(
-    st.lists(
-        st.tuples(*[st.floats(-0.3, 0.3)] * 3), min_size=1, max_size=3
-    ),
+    # No grid point lies on the side of a cube, where rounding would decide.
+    st.lists(st.tuples(*[st.integers(-300, 300)] * 3), min_size=1, max_size=3),
     st.sampled_from([(0.1, 0.0), (0.07, 0.5)]),
 )  # fmt: skip
 def test_the_union_of_grids_holds_every_node_once(centers, lattice):
-    union = NodeUnion.around(np.array(centers), *lattice)
+    centers = 0.001 * np.array(centers) + 0.00037
+    union = NodeUnion.around(centers, *lattice)
     points = union.points()
     assert len({tuple(p) for p in np.round(points, 6)}) == len(points)
     for cube, center in enumerate(centers):
