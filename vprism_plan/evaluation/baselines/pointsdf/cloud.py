@@ -125,8 +125,12 @@ def without_strays(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]
     """
     from scipy.spatial import cKDTree
 
-    near = cKDTree(points).query_ball_point(points, _NEIGHBOUR_RADIUS, return_length=True)
-    kept = points[np.asarray(near) > _NEIGHBOURS]
+    # The nearest is the point itself; those beyond the radius are infinitely far.
+    tree = cKDTree(points)
+    distance = np.asarray(
+        tree.query(points, k=[_NEIGHBOURS + 1], distance_upper_bound=_NEIGHBOUR_RADIUS)[0]
+    )
+    kept = points[np.isfinite(distance[:, 0])]
     return kept if len(kept) else points
 
 

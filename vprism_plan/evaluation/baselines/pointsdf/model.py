@@ -10,6 +10,7 @@ and layer normalisation, which unlike the original's batch normalisation answers
 same whatever stands beside it.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -39,7 +40,7 @@ class Architecture:
     cloud: int = 256
     centers: tuple[int, int] = (96, 24)
     neighbours: int = 16
-    features: tuple[int, int, int] = (48, 96, 128)
+    features: tuple[int, int, int] = (48, 80, 120)
     kernels: int = 8
     width: int = 128
     depth: int = 6
@@ -62,7 +63,13 @@ class Architecture:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
         """Rebuild from `to_dict`, also after JSON made lists of tuples."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})
+        sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+        return cls(**sizes)
+
+
+# Of every centre the indices of its neighbours (b, m, k), or None for "all points"; and their
+# relative sparsity (b, m, k, 1).
+Surroundings = tuple[Tensor | None, Tensor]
 
 
 class PointConv(nn.Module):
@@ -97,23 +104,33 @@ class PointConv(nn.Module):
         self.mix = nn.Linear(hidden * kernels, out)
         self.norm = nn.LayerNorm(out)
 
-    def forward(
-        self, points: Float[Tensor, "b n 3"], features: Float[Tensor, "b n f"]
-    ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m out"]]:
-        """Return the centres and their features."""
+    def surroundings(self, points: Float[Tensor, "b n 3"]) -> Surroundings:
+        """Return who neighbours whom and how thinly: only distances between points matter."""
         sparse = self._inverse_density(points)
         if self.centers is None:
-            centers = points.new_zeros(len(points), 1, 3)
-            offset, seen = points[:, None], torch.cat([points, features], -1)[:, None]
+            index = None
             sparse = sparse[:, None]
         else:
-            centers = points[:, : self.centers]
-            index = nearest(centers, points, self.neighbours)
-            offset = gather(points, index) - centers[:, :, None]
-            seen = torch.cat([offset, gather(features, index)], -1)
+            index = nearest(points[:, : self.centers], points, self.neighbours)
             sparse = gather(sparse, index)
         # Relative to the sparsest neighbour, as only differences between neighbours matter.
-        sparse = sparse / sparse.amax(dim=2, keepdim=True)
+        return index, sparse / sparse.amax(dim=2, keepdim=True)
+
+    def forward(
+        self,
+        points: Float[Tensor, "b n 3"],
+        features: Float[Tensor, "b n f"],
+        surroundings: Surroundings | None = None,
+    ) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m out"]]:
+        """Return the centres and their features; `surroundings` if they are known already."""
+        index, sparse = self.surroundings(points) if surroundings is None else surroundings
+        if index is None:
+            centers = points.new_zeros(len(points), 1, 3)
+            offset, seen = points[:, None], torch.cat([points, features], -1)[:, None]
+        else:
+            centers = points[:, : index.shape[1]]
+            offset = gather(points, index) - centers[:, :, None]
+            seen = torch.cat([offset, gather(features, index)], -1)
         lifted = self.lift(seen) * self.dense(sparse)
         kernel = self.weigh(offset / self._reach(offset))
         outer = torch.einsum("bmkc,bmkw->bmcw", lifted, kernel) / lifted.shape[2]
@@ -156,13 +173,27 @@ class PointSDF(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(a.width, a.width) for _ in range(a.depth - 1))
         self.last = nn.Linear(a.width, 1)
 
+    def surroundings(self, cloud: Float[Tensor, "b n 3"]) -> list[Surroundings]:
+        """Return what each layer finds near its centres; turning or mirroring changes nothing."""
+        found, points = [], cloud
+        for layer in self.encoder:
+            assert isinstance(layer, PointConv)
+            found.append(layer.surroundings(points))
+            points = points[:, : layer.centers]
+        return found
+
     def embed(
-        self, cloud: Float[Tensor, "b n 3"], context: Float[Tensor, "b c"]
+        self,
+        cloud: Float[Tensor, "b n 3"],
+        context: Float[Tensor, "b c"],
+        surroundings: Sequence[Surroundings] | None = None,
     ) -> Float[Tensor, "b e"]:
         """Return the embedding of clouds in their normalised frame, farthest point first."""
         points, features = cloud, with_height(cloud, context)
-        for layer in self.encoder:
-            points, features = layer(points, features)
+        for i, layer in enumerate(self.encoder):
+            points, features = layer(
+                points, features, None if surroundings is None else surroundings[i]
+            )
         return torch.cat([features[:, 0], context], dim=-1)
 
     def answer(
@@ -185,9 +216,10 @@ class PointSDF(nn.Module):
         cloud: Float[Tensor, "b n 3"],
         context: Float[Tensor, "b c"],
         queries: Float[Tensor, "b q 3"],
+        surroundings: Sequence[Surroundings] | None = None,
     ) -> Float[Tensor, "b q"]:
         """Embed and answer."""
-        return self.answer(self.embed(cloud, context), queries)
+        return self.answer(self.embed(cloud, context, surroundings), queries)
 
 
 def with_height(
@@ -211,4 +243,4 @@ def nearest(a: Float[Tensor, "b m 3"], b: Float[Tensor, "b n 3"], k: int) -> Ten
 def gather(values: Float[Tensor, "b n f"], index: Tensor) -> Float[Tensor, "b m k f"]:
     """Return values[b, index[b, m, k]]."""
     rows = torch.arange(len(values))[:, None, None]
-    return values[rows, index]
+    return values[rows, index.long()]
