@@ -4,9 +4,10 @@
 from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 _CELL = 0.01  # metres; a point's surroundings are its cell and the 26 around it
+BLOCK = 3.0 * _CELL
 
 
 def stray_points(points: Float[np.ndarray, "n 3"], share: float) -> Bool[np.ndarray, " n"]:
@@ -22,6 +23,12 @@ def stray_points(points: Float[np.ndarray, "n 3"], share: float) -> Bool[np.ndar
     """
     if share <= 0.0 or len(points) == 0:
         return np.zeros(len(points), dtype=bool)
+    density = points_around(points)
+    return density < share * np.median(density)
+
+
+def points_around(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Return how many of the points (m) lie in the `BLOCK` wide block around each."""
     cells, inverse, counts = np.unique(
         np.floor(points / _CELL).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
@@ -32,5 +39,4 @@ def stray_points(points: Float[np.ndarray, "n 3"], share: float) -> Bool[np.ndar
     for shift in product((-1, 0, 1), repeat=3):
         near = (cells + np.array(shift)).tolist()
         around += np.array([index.get(tuple(cell), 0) for cell in near], dtype=np.int64)
-    density = around[inverse.reshape(-1)]
-    return density < share * np.median(density)
+    return around[inverse.reshape(-1)]

@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
+from vprism_plan.mapping.strays import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import transform_points
 
@@ -24,6 +25,8 @@ _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
 _THIN = 0.003
+# Share of what a surface shows below which points are flying pixels.
+_LONE = 0.03
 # Cells around the robot that it takes with it. Inside a cavity of occluded cells a field
 # whose nodes are two cells apart falls short of the distance by 2.8 cells at most.
 _ROOM = 2.0
@@ -216,7 +219,9 @@ def background_points(
 
     "Off" is `height` metres, or three standard deviations of the depth noise as it
     shows along the normal, if that is more. Without a plane every unlabelled point is.
-    Points of the robot are not background.
+    Points of the robot are not background, nor are flying pixels: those that, with all
+    other points off the plane, fill less than 3 percent of what a surface that faces the
+    camera would show in the 3 cm around them. A rod 1 mm thick fills that.
     """
     kept, widths = [], []
     for view in views:
@@ -225,7 +230,10 @@ def background_points(
         chosen = (labels == 0) & ~view.sees_robot[view.depth > 0]
         if plane is not None:
             threshold = np.maximum(height, 3.0 * _height_sigma(view, points, depth, plane))
-            chosen &= plane.signed_distance(points) > threshold
+            off = plane.signed_distance(points) > threshold
+            chosen &= off
+            focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
+            chosen[off] &= points_around(points[off]) >= _LONE * (BLOCK * focal / depth[off]) ** 2
         kept.append(points[chosen])
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
         widths.append(0.5 * depth[chosen] / focal)
