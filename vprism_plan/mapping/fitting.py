@@ -63,6 +63,40 @@ def fit_map(
         MapError: the objects would need too many hinge points.
     """
     config = MapConfig() if config is None else config
+    problem = learning_problem(observations, config, seed)
+    prior = weight_prior(problem.space, config, len(problem.object_ids) + 1)
+    posterior = _learn(problem.space, problem.data, prior, config)
+    return VPrismMap(
+        config, problem.object_ids, problem.plane, problem.views, problem.space, posterior, seed
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LearningProblem:
+    """What a map is learned from, and in which features.
+
+    Attributes:
+        views: the observations.
+        object_ids: sorted labels of the objects.
+        plane: support surface, world frame.
+        data: labelled points.
+        space: hinge points and kernel.
+    """
+
+    views: tuple[Observation, ...]
+    object_ids: tuple[int, ...]
+    plane: Plane
+    data: TrainingData
+    space: FeatureSpace
+
+
+def learning_problem(
+    observations: Observation | Sequence[Observation], config: MapConfig, seed: int
+) -> LearningProblem:
+    """Return the data and features of `fit_map`, for it and for what is compared with it.
+
+    Arguments and errors are those of `fit_map`.
+    """
     views = (observations,) if isinstance(observations, Observation) else tuple(observations)
     object_ids = _object_ids(views)
     plane = _support_plane(views, seed)
@@ -73,9 +107,7 @@ def fit_map(
         config.gamma,
         config.cutoff_radius,
     )
-    prior = weight_prior(space, config, len(object_ids) + 1)
-    posterior = _learn(space, data, prior, config)
-    return VPrismMap(config, object_ids, plane, views, space, posterior, seed)
+    return LearningProblem(views, object_ids, plane, data, space)
 
 
 def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:

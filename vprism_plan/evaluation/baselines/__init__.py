@@ -43,6 +43,8 @@ METHODS: dict[str, Method] = {
             "maps",
             "fit_no_stratified",
         ),
+        _method("sigmoid", "Sigmoid maps, one per object", "sigmoid"),
+        _method("sgd", "Point estimate (SGD)", "sgd", uncertainty=False),
         _method("voxel", "Voxel", "voxel", continuous=False, uncertainty=False),
     )
 }
