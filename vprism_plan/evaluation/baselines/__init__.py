@@ -46,6 +46,8 @@ METHODS: dict[str, Method] = {
         _method("sigmoid", "Sigmoid maps, one per object", "sigmoid"),
         _method("sgd", "Point estimate (SGD)", "sgd", uncertainty=False),
         _method("voxel", "Voxel", "voxel", continuous=False, uncertainty=False),
+        _method("octomap", "OctoMap", "octomap", continuous=False),
+        _method("pointsdf", "PointSDF", "pointsdf", level=0.3, uncertainty=False),
     )
 }
 
