@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a parsed command to the code that runs it, loaded only then."""
 
-from vprism_plan.cli._commands import Command, Demo, Map, Mesh, Query
+from vprism_plan.cli._commands import Command, Demo, Eval, Map, Mesh, Query
 from vprism_plan.cli._console import Console
 
 
@@ -18,6 +18,10 @@ def run(command: Command) -> int:
         from vprism_plan.cli._query import run_query
 
         return run_query(command, console)
+    if isinstance(command, Eval):
+        from vprism_plan.cli._evaluate import run_eval
+
+        return run_eval(command, console)
     if isinstance(command, Demo):
         from vprism_plan.demo import run_demo
 

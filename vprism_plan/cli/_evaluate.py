@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The command `eval`: one table of results, computed as far as it is missing, and written."""
+
+import logging
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from vprism_plan.cli._commands import Eval
+from vprism_plan.cli._console import Console
+from vprism_plan.errors import ConfigError
+
+_SCENES = {"planning": 30, "uncertainty": 30}  # 100 for the others
+
+
+def run_eval(command: Eval, console: Console) -> int:
+    """Compute and report; exit code 0.
+
+    Raises:
+        ConfigError: an option that does not fit the table, or missing data.
+        SweepError: some scenes failed; all others are kept.
+    """
+    from vprism_plan.evaluation.generation import SETS
+
+    _check(command)
+    kinds = SETS if command.set == "all" else (command.set,)
+    scenes = _SCENES.get(command.table, 100) if command.scenes is None else command.scenes
+    root = _checkout()
+    base = Path.cwd() if root is None else root
+    store = base / "build" / "evaluation" if command.store is None else command.store
+    results = base / "results" if root is None else root / "docs" / "results"
+    output = results if command.output is None else command.output
+    with console.stage(command.table), _log_lines():
+        payload, lines, files = _TABLES.get(command.table, _reconstruction)(
+            command, kinds, scenes, store, output
+        )
+    payload = {
+        "table": command.table, "sets": list(kinds), "scenes": scenes,
+        "first_seed": command.first_seed, "command": command_line(command), **payload,
+        "files": files, "timings": console.timings,
+    }  # fmt: skip
+    names = ", ".join(file.name for file in files)
+    console.finish(payload, [*lines, f"wrote {output}/: {names}"])
+    return 0
+
+
+def _check(command: Eval) -> None:
+    if command.methods and command.table in ("planning", "uncertainty"):
+        raise ConfigError(f"--methods does not go with {command.table}; leave it out")
+    if command.set == "folder" and command.data is None:
+        raise ConfigError("--set folder needs --data, the folder of meshes")
+    if command.first_seed < 0:
+        raise ConfigError(f"--first-seed is {command.first_seed}; it must be at least 0")
+    if command.cluster is not None and command.backend == "loky":
+        raise ConfigError("--cluster needs --backend dask or ray; loky runs on this machine")
+
+
+def _checkout() -> Path | None:
+    """Return the checkout that this package runs from; None if it is installed elsewhere."""
+    root = Path(__file__).resolve().parents[2]
+    return root if (root / "pyproject.toml").is_file() and (root / "docs").is_dir() else None
+
+
+def command_line(command: Eval) -> str:
+    """Return the shortest call that gives the same results."""
+    words = ["vprism-plan", "eval", command.table]
+    if command.set != "all":
+        words += ["--set", command.set]
+    if command.scenes is not None:
+        words += ["--scenes", str(command.scenes)]
+    if command.first_seed != 1000:
+        words += ["--first-seed", str(command.first_seed)]
+    if command.methods:
+        words += ["--methods", *command.methods]
+    if command.data is not None:
+        words += ["--data", command.data.name if command.set != "folder" else str(command.data)]
+    return shlex.join(words)
+
+
+@contextmanager
+def _log_lines() -> Iterator[None]:
+    """Where no terminal shows a bar, let the experiments say how far they are."""
+    log = logging.getLogger("vprism_plan.evaluation.experiments")
+    if sys.stderr.isatty():
+        yield
+        return
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+    before = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
+
+
+Report = tuple[dict[str, Any], list[str], list[Path]]
+
+
+def _reconstruction(
+    command: Eval, kinds: tuple[str, ...], scenes: int, store: Path, output: Path
+) -> Report:
+    """Run one of the tables of reconstruction."""
+    from vprism_plan.evaluation.experiments.tables import run
+
+    results, files = run(
+        command.table, kinds=kinds, scenes=scenes, first_seed=command.first_seed,
+        methods=command.methods, data=command.data, store=store / "reconstruction",
+        output=output, jobs=command.jobs, backend=command.backend, cluster=command.cluster,
+        command=command_line(command),
+    )  # fmt: skip
+    claims = [
+        {"claim": text, "set": kind, **verdict.to_dict()}
+        for text, verdicts in results.verdicts.items()
+        for kind, verdict in verdicts.items()
+    ]
+    means = {
+        found.kind: {
+            key: {"iou": s.all.mean_iou, "chamfer": s.all.mean_chamfer, "lost": s.all.lost}
+            for key, s in found.scores.items()
+        }
+        for found in results.sets
+    }
+    lines = [
+        f"{kind} {key}: IoU {row['iou']:.3f}, Chamfer {1000 * row['chamfer']:.1f} mm"
+        + (f", {row['lost']} lost" if row["lost"] else "")
+        for kind, rows in means.items()
+        for key, row in rows.items()
+    ]
+    return {"means": means, "claims": claims}, lines, files
+
+
+_TABLES: dict[str, Any] = {}

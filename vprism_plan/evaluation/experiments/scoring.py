@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The task behind the tables: one method on one scene, and all that the answer depends on."""
+
+import hashlib
+import subprocess
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.evaluation.baselines import method
+from vprism_plan.evaluation.experiments.store import Case
+from vprism_plan.evaluation.protocols import Reconstruction, TrueScene
+from vprism_plan.evaluation.reconstruction import evaluate_reconstruction
+from vprism_plan.evaluation.scene_truth import SceneTruth
+from vprism_plan.mapping import MapConfig
+from vprism_plan.perception.observation import Observation
+
+# Raised by hand when the meaning of the code changes, and only then: what is stored stays
+# valid through everything else. Of the scenes, of the scores, of each method.
+SCENES, SCORES = 1, 1
+_METHODS: dict[str, int] = {}  # 1 for what is not listed
+# Methods that fit with a preset that may still be tuned: it is part of the question.
+_PRESETS = {
+    "vprism": MapConfig, "sgd": MapConfig, "sigmoid": MapConfig, "vprism-fine": MapConfig.fine,
+}  # fmt: skip
+
+
+def method_question(key: str) -> dict[str, Any]:
+    """Return what the answers of a method depend on besides the scene."""
+    chosen = method(key)
+    question: dict[str, Any] = {
+        "key": key, "level": chosen.level, "version": _METHODS.get(key, 1),
+    }  # fmt: skip
+    if key in _PRESETS:
+        question["config"] = asdict(_PRESETS[key]())
+    return question
+
+
+def scene_question(kind: str, seed: int, data: Path | None = None) -> dict[str, Any]:
+    """Return what a generated scene depends on."""
+    folder = None if data is None or kind not in ("ycb", "folder") else str(data)
+    return {"set": kind, "seed": seed, "data": folder, "version": SCENES}
+
+
+def cases(
+    kind: str, seeds: Iterable[int], methods: Iterable[str], data: Path | None = None
+) -> list[Case]:
+    """Return one case per scene and method, those of a scene next to each other."""
+    questions = [(key, method_question(key)) for key in methods]
+    return [
+        Case(
+            f"{kind}-{seed}-{key}",
+            {"scene": scene_question(kind, seed, data), "method": question, "scores": SCORES},
+        )
+        for seed in seeds
+        for key, question in questions
+    ]
+
+
+def scene_of(case: Case) -> tuple[str, int]:
+    """Return what cases of the same scene have in common: how `sweep` groups them."""
+    scene = case.asked["scene"]
+    return scene["set"], scene["seed"]
+
+
+def score(case: Case) -> dict[str, Any]:
+    """Fit one method to one scene and score it: a task for `sweep`.
+
+    The answer has the `scores` (`ReconstructionScores`), how many labelled objects the
+    scene has, `seconds` of processor time of the fit and of predicting, how many points
+    were predicted, the commit that computed it, and a digest of what the camera saw.
+    """
+    scene, truth = _prepared(**case.asked["scene"])
+    chosen = method(case.asked["method"]["key"])
+    began = time.process_time()
+    found = _Timed(chosen.fit(scene.observation, scene.seed))
+    fit_seconds = time.process_time() - began
+    scores = evaluate_reconstruction(
+        scene, found, chosen.level, continuous=chosen.continuous, truth=truth
+    )
+    return {
+        "scene": scene.name,
+        "objects": len(scene.object_ids),
+        "scores": scores.to_dict(),
+        "seconds": {"fit": fit_seconds, "predict": found.seconds},
+        "predicted_points": found.points,
+        "commit": commit(),
+        "seen": _digest(scene.observation),
+    }
+
+
+@lru_cache(maxsize=1)
+def _prepared(set: str, seed: int, data: str | None, version: int) -> tuple[TrueScene, SceneTruth]:
+    """Make a scene and its truth once for all methods that follow each other."""
+    from vprism_plan.evaluation.generation import generate
+
+    scene = generate(set, seed, data=None if data is None else Path(data))
+    return scene, SceneTruth.of(scene)
+
+
+class _Timed:
+    """A reconstruction that adds up the processor time of its predictions."""
+
+    def __init__(self, found: Reconstruction) -> None:
+        self.found = found
+        self.seconds = 0.0
+        self.points = 0
+
+    @property
+    def object_ids(self) -> tuple[int, ...]:
+        return self.found.object_ids
+
+    def predict_proba(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
+        began = time.process_time()
+        proba = self.found.predict_proba(points)
+        self.seconds += time.process_time() - began
+        self.points += len(points)
+        return proba
+
+
+def _digest(seen: Observation) -> str:
+    """Tell scenes apart that a changed generator makes of the same seed."""
+    digest = hashlib.sha256(np.ascontiguousarray(seen.depth).tobytes())
+    digest.update(np.ascontiguousarray(seen.labels).tobytes())
+    return digest.hexdigest()[:16]
+
+
+@cache
+def commit() -> str:
+    """Return the commit of this code, "+" added where files differ; "unknown" outside git."""
+    root = Path(__file__).resolve().parents[3]
+    if not (root / ".git").exists():
+        return "unknown"
+    try:
+        head = _git(root, "rev-parse", "--short=10", "HEAD")
+        changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", "vprism_plan")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head + ("+" if changed else "")
+
+
+def _git(root: Path, *arguments: str) -> str:
+    done = subprocess.run(
+        ["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()

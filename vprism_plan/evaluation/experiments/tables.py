@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The tables of reconstruction: which methods, on which scenes, and what is said of them.
+
+    run("baselines", kinds=("ycb",), scenes=100, output=Path("docs/results"))
+
+Every answer is kept per scene and method, for all tables together: a method that two tables
+share is computed once, and one that is added later makes nothing else run again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.baselines import method
+from vprism_plan.evaluation.experiments import scoring
+from vprism_plan.evaluation.experiments.claims import REPORTED, Verdict, claims_of, decide, gain
+from vprism_plan.evaluation.experiments.intervals import SceneScores, estimate
+from vprism_plan.evaluation.experiments.sweep import sweep
+from vprism_plan.evaluation.reconstruction import ReconstructionScores
+
+
+@dataclass(frozen=True)
+class Table:
+    """A comparison of methods.
+
+    Attributes:
+        key: on the command line and in file names.
+        title: of the report.
+        about: what is compared, in a sentence or two.
+        methods: rows, in order.
+        reference: what the others are held against, scene by scene.
+    """
+
+    key: str
+    title: str
+    about: str
+    methods: tuple[str, ...]
+    reference: str
+
+
+TABLES = {
+    table.key: table
+    for table in (
+        Table(
+            "baselines",
+            "Reconstruction: V-PRISM and the systems it is compared with",
+            "Table I of the paper, with more systems: every method sees the same single depth "
+            "image and the same object labels.",
+            ("voxel", "octomap", "sgd", "sigmoid", "pointsdf", "vprism-paper", "vprism"),
+            "vprism",
+        ),
+        Table(
+            "sampling",
+            "Reconstruction: what the parts of the negative sampling bring",
+            "Table II of the paper: the paper's preset, whole and with parts of its sampling "
+            "replaced or left out.",
+            ("bhm-sampling", "vprism-paper", "no-under-table", "no-stratified"),
+            "vprism-paper",
+        ),
+        Table(
+            "presets",
+            "Reconstruction: our presets against the paper's",
+            "The settings of Table III of the paper, the default of this package, and its finer "
+            "and slower variant.",
+            ("vprism-paper", "vprism", "vprism-fine"),
+            "vprism-paper",
+        ),
+    )
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SetResults:
+    """One set of scenes.
+
+    Attributes:
+        kind: which set.
+        seeds: of the scenes, in order.
+        objects: labelled objects of each scene, hidden ones included.
+        scores: of each method, scene by scene.
+        costs: of each method: median processor seconds per fit, microseconds per
+            predicted point.
+        commits: that computed any of it.
+    """
+
+    kind: str
+    seeds: tuple[int, ...]
+    objects: tuple[int, ...]
+    scores: dict[str, SceneScores]
+    costs: dict[str, tuple[float, float]]
+    commits: frozenset[str]
+
+
+@dataclass(frozen=True, eq=False)
+class TableResults:
+    """A table on all its sets. `verdicts[claim text][kind]` says which claims hold where."""
+
+    table: Table
+    methods: tuple[str, ...]
+    sets: tuple[SetResults, ...]
+    command: str
+    verdicts: dict[str, dict[str, Verdict]]
+
+
+def run(
+    key: str,
+    *,
+    kinds: Sequence[str],
+    scenes: int = 100,
+    first_seed: int = 1000,
+    methods: Sequence[str] = (),
+    data: Path | None = None,
+    store: Path,
+    output: Path,
+    jobs: int = 2,
+    backend: str = "loky",
+    cluster: Any = None,
+    command: str = "",
+    progress: bool = True,
+) -> tuple[TableResults, list[Path]]:
+    """Compute what is missing of a table, write its report; return results and files.
+
+    Args:
+        key: of `TABLES`.
+        kinds: sets of scenes (see `generation.source`).
+        scenes, first_seed: seeds first_seed to first_seed + scenes - 1 of each set.
+        methods: some of the table's, or others instead; empty for all of the table.
+        data: folder of meshes, for the sets that need one.
+        store: folder of answers, shared by all tables.
+        output: folder of KEY.md, KEY.json and pictures.
+        jobs, backend, cluster, progress: see `sweep`.
+        command: that reprints this, for the report.
+
+    Raises:
+        ConfigError: unknown table, set or method, no scene, or missing data.
+        SweepError: some scenes failed; all others are kept.
+    """
+    from vprism_plan.evaluation.experiments.report import write_report
+
+    table = chosen_table(key)
+    chosen = tuple(methods) or table.methods
+    if scenes < 1:
+        raise ConfigError(f"scenes is {scenes}; it must be at least 1")
+    _check_sets(kinds, data)
+    seeds = range(first_seed, first_seed + scenes)
+    # Seed by seed, so that a run that is cut short has as many scenes of every set.
+    cases = [
+        case
+        for seed in seeds
+        for kind in kinds
+        for case in scoring.cases(kind, [seed], chosen, data)
+    ]
+    answers = sweep(
+        scoring.score, cases, store, jobs=jobs, backend=backend, progress=progress,
+        group=scoring.scene_of, cluster=cluster,
+    )  # fmt: skip
+    by_set = {kind: {key: [] for key in chosen} for kind in kinds}  # type: dict[str, dict[str, list[dict[str, Any]]]]
+    for case, answer in zip(cases, answers, strict=True):
+        by_set[case.asked["scene"]["set"]][case.asked["method"]["key"]].append(answer)
+    sets = tuple(_collected(kind, tuple(seeds), found) for kind, found in by_set.items())
+    results = TableResults(table, chosen, sets, command, _verdicts(key, chosen, sets))
+    return results, write_report(results, output)
+
+
+def chosen_table(key: str) -> Table:
+    """Return the table of that key; ConfigError naming the keys if there is none."""
+    if key not in TABLES:
+        raise ConfigError(f"there is no table {key!r}; valid: {', '.join(TABLES)}")
+    return TABLES[key]
+
+
+def _check_sets(kinds: Sequence[str], data: Path | None) -> None:
+    """Complain about missing meshes before anything runs."""
+    from vprism_plan.evaluation.generation import source
+
+    if not kinds:
+        raise ConfigError("no set of scenes is named; give at least one")
+    for kind in kinds:
+        source(kind, data)
+
+
+def _collected(
+    kind: str, seeds: tuple[int, ...], found: dict[str, list[dict[str, Any]]]
+) -> SetResults:
+    """Put the answers of one set together.
+
+    Raises:
+        ConfigError: methods were stored that saw different scenes of one seed.
+    """
+    first = next(iter(found.values()))
+    for key, answers in found.items():
+        for seed, one, other in zip(seeds, first, answers, strict=True):
+            if one["seen"] != other["seen"]:
+                raise ConfigError(
+                    f"stored answers of {key} and {next(iter(found))} are about different scenes "
+                    f"{kind} {seed}: the generator has changed between them; remove the store, or "
+                    "raise experiments.scoring.SCENES"
+                )
+    return SetResults(
+        kind,
+        seeds,
+        tuple(int(answer["objects"]) for answer in first),
+        {
+            key: SceneScores([ReconstructionScores.from_dict(a["scores"]) for a in answers])
+            for key, answers in found.items()
+        },
+        {
+            key: (
+                float(np.median([a["seconds"]["fit"] for a in answers])),
+                1e6 * sum(a["seconds"]["predict"] for a in answers)
+                / max(1, sum(a["predicted_points"] for a in answers)),
+            )
+            for key, answers in found.items()
+        },
+        frozenset(str(a["commit"]) for answers in found.values() for a in answers),
+    )  # fmt: skip
+
+
+def _verdicts(
+    key: str, methods: Sequence[str], sets: Sequence[SetResults]
+) -> dict[str, dict[str, Verdict]]:
+    return {
+        claim.text: {found.kind: decide(claim, found.scores) for found in sets}
+        for claim in claims_of(key, methods)
+    }
+
+
+def summary(results: TableResults) -> dict[str, Any]:
+    """Return every figure of a table with its interval, ready for JSON."""
+    return {
+        "table": results.table.key,
+        "command": results.command,
+        "commits": sorted({c for found in results.sets for c in found.commits}),
+        "sets": {found.kind: _set_summary(found, results) for found in results.sets},
+        "claims": [
+            {"claim": text, **{kind: verdict.to_dict() for kind, verdict in verdicts.items()}}
+            for text, verdicts in results.verdicts.items()
+        ],
+    }
+
+
+def _set_summary(found: SetResults, results: TableResults) -> dict[str, Any]:
+    reference = found.scores.get(results.table.reference)
+    rows = {}
+    for key, scores in found.scores.items():
+        n = len(scores)
+        row: dict[str, Any] = {
+            "label": method(key).label,
+            "level": method(key).level,
+            "iou": estimate(scores.iou(), n).to_dict(),
+            "chamfer": estimate(scores.chamfer(), n).to_dict(),
+            "lost": scores.all.lost,
+            "fit_seconds": found.costs[key][0],
+            "predict_microseconds": found.costs[key][1],
+            "brier": {p: estimate(scores.brier(c), n).to_dict() for p, c in REPORTED.items()},
+            "ece": {p: estimate(scores.ece(c), n).to_dict() for p, c in REPORTED.items()},
+            "entropy": {p: estimate(scores.entropy(c), n).to_dict() for p, c in REPORTED.items()},
+            "reliability": [part.to_dict() for part in scores.all.parts],
+            "scenes": [
+                {"seed": seed, "iou": _plain(s.mean_iou), "chamfer": _plain(s.mean_chamfer)}
+                for seed, s in zip(found.seeds, scores.scenes, strict=True)
+            ],
+        }
+        if reference is not None and reference is not scores:
+            row["against_reference"] = {
+                "iou": estimate(gain(scores, reference, "iou"), n).to_dict(),
+                "chamfer_saved": estimate(gain(scores, reference, "chamfer"), n).to_dict(),
+                "brier_occluded": estimate(gain(scores, reference, "brier"), n).to_dict(),
+                "ece_occluded": estimate(gain(scores, reference, "ece"), n).to_dict(),
+            }
+        rows[key] = row
+    some = next(iter(found.scores.values())).all
+    return {
+        "seeds": [found.seeds[0], found.seeds[-1]],
+        "scenes": len(found.seeds),
+        "objects": sum(found.objects),
+        "judged": len(some.objects),
+        "hidden": some.hidden,
+        "points": {p: sum(some.parts[k].n for k in c) for p, c in REPORTED.items()},
+        "methods": rows,
+    }
+
+
+def _plain(value: float) -> float | None:
+    return None if np.isnan(value) else value
