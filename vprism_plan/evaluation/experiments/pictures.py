@@ -97,7 +97,10 @@ def scenes(results: TableResults, across: str, up: str) -> Figure:
         largest = 0.0
         for number, found in enumerate(results.sets):
             x, y = (scale * _by_scene(found, key, metric) for key in (across, up))
-            axes.plot(x, y, "o", markersize=4, color=_color(number), label=found.kind, alpha=0.8)
+            axes.plot(
+                x, y, "os^vD"[number % 5], markersize=4, color=_color(number), alpha=0.8,
+                label=found.kind,
+            )  # fmt: skip
             largest = max(largest, float(np.nanmax([*x, *y, 0.0])))
         limit = 1.0 if metric == "mean_iou" else 1.05 * max(largest, 1.0)
         axes.plot([0, limit], [0, limit], color="0.6", linewidth=1, linestyle="--")

@@ -7,7 +7,7 @@ from typing import Any
 
 from vprism_plan._files import write_text
 from vprism_plan.evaluation.baselines import method
-from vprism_plan.evaluation.experiments.claims import REPORTED, Verdict
+from vprism_plan.evaluation.experiments.claims import REPORTED, Claim, Verdict, claims_of
 from vprism_plan.evaluation.experiments.intervals import CONFIDENCE, RESAMPLES
 from vprism_plan.evaluation.experiments.tables import SetResults, TableResults, summary
 from vprism_plan.evaluation.scene_truth import CLOUD, REACH, SPACING
@@ -74,11 +74,9 @@ def _claims(results: TableResults) -> list[str]:
     kinds = [found.kind for found in results.sets]
     lines = ["## What holds", "", "| statement | " + " | ".join(kinds) + " |"]
     lines.append("|---" * (1 + len(kinds)) + "|")
-    for text, verdicts in results.verdicts.items():
-        metric = "share" if "Chamfer" in text else "difference"
-        several = any("every" in text or "order" in text or "than all" in text for _ in kinds)
-        cells = [_verdict(verdicts[kind], metric, several) for kind in kinds]
-        lines.append(f"| {text} | " + " | ".join(cells) + " |")
+    for claim in claims_of(results.table.key, results.methods):
+        cells = [_verdict(claim, results.verdicts[claim.text][kind]) for kind in kinds]
+        lines.append(f"| {claim.text} | " + " | ".join(cells) + " |")
     lines += [
         "",
         "In brackets: the gain and its 95 % interval over scenes, above 0 is better; for Chamfer "
@@ -90,13 +88,13 @@ def _claims(results: TableResults) -> list[str]:
     return lines
 
 
-def _verdict(verdict: Verdict, metric: str, several: bool) -> str:
-    scale, unit, digits = (100.0, " %", 0) if metric == "share" else (1.0, "", 3)
+def _verdict(claim: Claim, verdict: Verdict) -> str:
+    scale, unit, digits = (100.0, " %", 0) if claim.metric == "chamfer" else (1.0, "", 3)
     g = verdict.gain
     numbers = f"{scale * g.value:+.{digits}f}{unit}"
     if g.low == g.low:
         numbers += f" [{scale * g.low:.{digits}f}, {scale * g.high:.{digits}f}]"
-    named = f"; {verdict.pair[0]} vs {verdict.pair[1]}" if several else ""
+    named = f"; {verdict.pair[0]} vs {verdict.pair[1]}" if len(claim.pairs) > 1 else ""
     return f"**{verdict.answer}** ({numbers}{named})"
 
 
@@ -175,7 +173,7 @@ def _explanation() -> list[str]:
     """What the columns mean."""
     return [
         "## What the columns mean", "",
-        f"All figures come with a {CONFIDENCE:.0%} bootstrap interval: scenes are drawn again "
+        f"In brackets is a {100 * CONFIDENCE:.0f} % bootstrap interval: scenes are drawn again "
         f"({RESAMPLES} times, percentiles), since objects of one scene hide one another.", "",
         "- **IoU**: intersection over union of an object with {x : P(object | x) >= level}, "
         f"level 0.5 unless stated, over grid points {100 * SPACING:g} cm apart within "
