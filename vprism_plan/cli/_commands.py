@@ -171,11 +171,12 @@ class Eval:
     set: Literal["all", "analytic", "ycb", "random", "random-train", "folder"] = "all"
     """Objects of the scenes; "all" is analytic, ycb and random."""
     scenes: Annotated[int | None, arg(metavar="INT")] = None
-    """Scenes of each set; default 100, for uncertainty and planning 30."""
+    """Scenes of each set, default 100, for uncertainty 30; for planning of all sets together,
+    default 30."""
     first_seed: int = 1000
     """Seed of the first scene; the others follow. 0 to 99 are for tuning."""
     methods: Annotated[tuple[str, ...], arg(metavar="KEY ...")] = ()
-    """Only these rows, in this order; default all of the table's."""
+    """Only these rows, in this order; default all of the table's. For planning, checkers."""
     data: Annotated[Path | None, arg(metavar="PATH")] = None
     """Folder of meshes (m) for --set folder, or of the YCB objects."""
     store: Annotated[Path | None, arg(metavar="PATH")] = None
