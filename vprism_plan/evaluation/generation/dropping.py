@@ -13,14 +13,18 @@ from jaxtyping import Float
 from vprism_plan.errors import MissingDependencyError
 from vprism_plan.evaluation.generation.shapes import Shape
 
+_NO_SLIP = 5  # iterations of the solver that keeps contacts from sliding slowly
 _DENSITY = 400.0  # kg/m^3, of the hulls
 _TIME_STEP = 0.002  # seconds
 _TIME_LIMIT = 8.0  # seconds until every object must rest
 _GATHERING = 0.8  # seconds from the start during which everything is drawn together
 _PULL = 6.0  # m/s^2 towards the middle meanwhile
-_CALM = 0.3  # seconds that it must rest
+_CALM = 0.1  # seconds that speeds must stay below a limit
 _CHUNK = 25  # steps between looks
-_SLOW = (0.002, 0.02)  # m/s and rad/s that count as rest
+_SLOW = (0.01, 0.1)  # m/s and rad/s after which friction is made firm
+_STILL = (0.002, 0.02)  # m/s and rad/s that look like rest
+_PROOF = 0.5  # seconds for which everything, let go without speed, must then stay
+_STAYS = (0.0002, 0.005)  # metres and radians of motion that count as staying
 _DAMPING = np.repeat([0.1, 1e-3], 3)  # N s/m, N m s/rad: ends the rolling of round objects
 _OVERLAP = 0.0008  # metres by which hulls may press into each other and the table
 _REGION = 0.3  # metres around the middle of the pile that every object must lie within
@@ -35,7 +39,8 @@ def drop(shapes: list[Shape], rng: np.random.Generator) -> Float[np.ndarray, "n 
     Objects start in random orientations, close together, and fall at the same time.
     Returns None when something does not come to rest within 8 simulated seconds, rolls
     farther than 30 cm from the others, or is pressed into its neighbour by more than
-    0.8 mm: the caller tries again with other numbers.
+    0.8 mm: the caller tries again with other numbers. At rest means: released without
+    speed at these very poses, nothing moves by 0.2 mm or 0.005 rad in 0.5 s.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -44,18 +49,37 @@ def drop(shapes: list[Shape], rng: np.random.Generator) -> Float[np.ndarray, "n 
     model = _compile(mujoco, shapes)
     data = mujoco.MjData(model)
     data.qpos[:] = _start(shapes, rng).ravel()
-    if not _settle(mujoco, model, data):
+    if not _settle(mujoco, model, data, _SLOW):
         return None
-    if data.ncon and float(np.asarray(data.contact.dist).min()) < -_OVERLAP:
-        return None
-    poses = _poses(mujoco, data.qpos.reshape(-1, 7))
-    middle = poses[:, :2, 3].mean(axis=0)
-    # Rounded to micrometres, so that the move itself is no source of odd bits.
-    poses[:, :2, 3] = np.round(poses[:, :2, 3] - middle, 6)
-    poses[:, 2, 3] = np.round(poses[:, 2, 3], 6)
-    if np.linalg.norm(poses[:, :2, 3], axis=1).max() > _REGION:
-        return None
-    return poses
+    # MuJoCo's friction is soft: what leans would creep until it falls. The cure is dear,
+    # so the fall itself does without it.
+    model.opt.noslip_iterations = _NO_SLIP
+    while _settle(mujoco, model, data, _STILL):
+        placed = _rounded(data.qpos.reshape(-1, 7))
+        data.qpos[:] = placed.ravel()
+        if _rests(mujoco, model, data):
+            fits = np.linalg.norm(placed[:, :2], axis=1).max() <= _REGION
+            return _poses(placed) if fits else None
+    return None
+
+
+def rest_motion(
+    shapes: list[Shape], poses: Float[np.ndarray, "n 4 4"], seconds: float
+) -> tuple[float, float]:
+    """Return how far shapes move and turn when released at rest at some poses: metres, radians.
+
+    Raises:
+        MissingDependencyError: MuJoCo is not installed.
+    """
+    from scipy.spatial.transform import Rotation
+
+    mujoco = _mujoco()
+    model = _compile(mujoco, shapes)
+    model.opt.noslip_iterations = _NO_SLIP
+    data = mujoco.MjData(model)
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
+    data.qpos[:] = np.concatenate([poses[:, :3, 3], turns], axis=1).ravel()
+    return _released(mujoco, model, data, seconds)
 
 
 def _mujoco() -> Any:
@@ -74,7 +98,7 @@ def _compile(mujoco: Any, shapes: list[Shape]) -> Any:
     spec.option.timestep = _TIME_STEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0  # friction as firm as the contacts: nothing creeps
+    spec.option.impratio = 10.0  # friction ten times as firm as the contacts
     # Several contacts per pair, so that a face on a face does not rock: MuJoCo 4 always
     # has them, MuJoCo 3 only where asked.
     if hasattr(mujoco.mjtEnableBit, "mjENBL_MULTICCD"):
@@ -132,23 +156,63 @@ def _lowest(
     return float(max(tops.max(initial=0.0), 0.0) + _GAP - low[k, 2])
 
 
-def _settle(mujoco: Any, model: Any, data: Any) -> bool:
-    """Step until everything has been slow for a while; whether that happened in time."""
+def _settle(mujoco: Any, model: Any, data: Any, limits: tuple[float, float]) -> bool:
+    """Step until everything is slower than the limits for a while; whether it was in time."""
     calm = 0.0
     while data.time < _TIME_LIMIT:
-        data.xfrc_applied[1:, :2] = _pull(model, data) if data.time < _GATHERING else 0.0
+        gathering = data.time < _GATHERING
+        data.xfrc_applied[1:, :2] = _pull(model, data) if gathering else 0.0
         mujoco.mj_step(model, data, _CHUNK)
         speed = data.qvel.reshape(-1, 6)
         still = (
-            np.linalg.norm(speed[:, :3], axis=1).max() < _SLOW[0]
-            and np.linalg.norm(speed[:, 3:], axis=1).max() < _SLOW[1]
+            np.linalg.norm(speed[:, :3], axis=1).max() < limits[0]
+            and np.linalg.norm(speed[:, 3:], axis=1).max() < limits[1]
         )
-        calm = calm + _CHUNK * _TIME_STEP if still else 0.0
+        calm = calm + _CHUNK * _TIME_STEP if still and not gathering else 0.0
         if calm >= _CALM:
             return True
         if np.linalg.norm(data.qpos.reshape(-1, 7)[:, :2], axis=1).max() > 4 * _REGION:
             return False
     return False
+
+
+def _rounded(placed: np.ndarray) -> np.ndarray:
+    """Return positions and quaternions with the pile's middle above the origin, few digits.
+
+    Micrometres and nine digits: what is saved, shown and simulated on is one and the same.
+    """
+    moved = placed.copy()
+    moved[:, :2] -= moved[:, :2].mean(axis=0)
+    moved[:, :3] = np.round(moved[:, :3], 6)
+    moved[:, 3:] = np.round(moved[:, 3:], 9)
+    return moved
+
+
+def _rests(mujoco: Any, model: Any, data: Any) -> bool:
+    """Whether everything stays where it is, and nothing is pressed in too far.
+
+    A slow look is not rest: an object that balances takes its time to fall over.
+    """
+    mujoco.mj_forward(model, data)
+    pressed = data.ncon and float(np.asarray(data.contact.dist).min()) < -_OVERLAP
+    moved, turned = _released(mujoco, model, data, _PROOF)
+    return not pressed and moved < _STAYS[0] and turned < _STAYS[1]
+
+
+def _released(mujoco: Any, model: Any, data: Any, seconds: float) -> tuple[float, float]:
+    """Let go of everything without speed; return how far it moves (m) and turns (rad)."""
+    from scipy.spatial.transform import Rotation
+
+    before = data.qpos.reshape(-1, 7).copy()
+    data.qvel[:] = 0.0
+    data.qacc_warmstart[:] = 0.0
+    mujoco.mj_step(model, data, round(seconds / _TIME_STEP))
+    after = data.qpos.reshape(-1, 7)
+    turn = Rotation.from_quat(before[:, 3:], scalar_first=True).inv() * Rotation.from_quat(
+        after[:, 3:], scalar_first=True
+    )
+    moved = np.linalg.norm(after[:, :3] - before[:, :3], axis=1).max()
+    return float(moved), float(turn.magnitude().max())
 
 
 def _pull(model: Any, data: Any) -> np.ndarray:
@@ -165,9 +229,10 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
     return np.asarray(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
 
 
-def _poses(mujoco: Any, placed: np.ndarray) -> np.ndarray:
+def _poses(placed: np.ndarray) -> np.ndarray:
+    """Return transforms (n, 4, 4) of positions and quaternions (n, 7)."""
     poses = np.tile(np.eye(4), (len(placed), 1, 1))
     for pose, row in zip(poses, placed, strict=True):
-        pose[:3, :3] = _rotation(np.round(row[3:], 9))
+        pose[:3, :3] = _rotation(row[3:])
         pose[:3, 3] = row[:3]
     return poses

@@ -2,7 +2,7 @@
 """Meshes as the generator uses them: read once, cleaned, then scaled per scene."""
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,7 +41,7 @@ class Shape:
         """Edge lengths of the box around it, metres."""
         return np.asarray(np.ptp(self.vertices, axis=0))
 
-    @property
+    @cached_property
     def fill(self) -> float:
         """Volume as a share of the convex hull's; small for thin shells and lattices."""
         from scipy.spatial import ConvexHull
