@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Does it get safer? The same planner with different maps, judged by the true scene."""
+
+from vprism_plan.evaluation.planning_benchmark.checkers import CONTENDERS, Contender, contenders
+from vprism_plan.evaluation.planning_benchmark.problems import Criteria, Problem, find_problems
+from vprism_plan.evaluation.planning_benchmark.run import Answer, Limits, run
+from vprism_plan.evaluation.planning_benchmark.truth import PathTruth, Truth
+
+__all__ = [
+    "CONTENDERS",
+    "Answer",
+    "Contender",
+    "Criteria",
+    "Limits",
+    "PathTruth",
+    "Problem",
+    "Truth",
+    "contenders",
+    "find_problems",
+    "run",
+]

@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Who is compared: the same planner, robot and support plane with different worlds.
+
+All but the mesh checker are worlds of the same `CollisionChecker`, so only the map and what
+it says of unseen space differ. All see the same observation.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from vprism_plan._kernels import world as kernels
+from vprism_plan.collision import CheckerConfig, CollisionChecker
+from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.baselines import method
+from vprism_plan.evaluation.planning_benchmark.grid_world import (
+    GridWorld,
+    benchmark_bounds,
+    benchmark_grid,
+    empty_lattice,
+    support_plane,
+    world_of_lattice,
+)
+from vprism_plan.evaluation.protocols import TrueScene
+from vprism_plan.mapping.strays import stray_points
+from vprism_plan.robots import Robot
+from vprism_plan.world import Grid, World, WorldConfig
+from vprism_plan.world.config import OccludedPolicy
+from vprism_plan.world.distance import Lattice
+from vprism_plan.world.visibility import background_points, depth_sigma
+
+__all__ = ["CONTENDERS", "Bench", "Contender", "contenders"]
+
+_OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things
+_STRAYS = 0.03  # share of neighbours below which a point is a flying pixel, as in the map
+_CELLS = 2  # cells per grid step that observed points mark
+OCTOMAP_OCCUPIED = 1
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One row of the benchmark.
+
+    Attributes:
+        key: short name.
+        label: name in tables and pictures.
+        line: contenders of one line differ in one parameter only.
+        map: "vprism", "sgd", "points", "octomap" or "truth".
+        occluded: what a world of ours, or of the point estimate, does with occluded space;
+            of OctoMap: whether unknown voxels in the image are obstacles.
+        bounds: (margin in metres, bound on the collision probability or None) to plan with.
+            Of several, each gets an equal share of the time limit, and the first with which
+            the query succeeds makes the path.
+        meshes: whether FCL judges extracted meshes.
+    """
+
+    key: str
+    label: str
+    line: str
+    map: str
+    occluded: OccludedPolicy = "free"
+    bounds: tuple[tuple[float, float | None], ...] = ((0.0, None),)
+    meshes: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Contender":
+        """Rebuild from `to_dict`."""
+        return cls(**{**data, "bounds": tuple((m, r) for m, r in data["bounds"])})
+
+
+def _ours() -> Iterable[Contender]:
+    """Level sets with margins and bounds on risk, by what occluded space is taken for."""
+    policies: tuple[tuple[OccludedPolicy, str, str], ...] = (
+        ("occupied", "all", "occluded: obstacle"),
+        ("posterior", "beyond", "occluded: obstacle beyond support"),
+        ("free", "", "occluded: the map decides"),
+    )
+    margins = {"occupied": (0,), "posterior": (0, 10), "free": (0, 5, 10, 20, 30)}
+    risks = {"occupied": (), "posterior": (0.05,), "free": (0.01, 0.05, 0.2, 0.5)}
+    for policy, short, words in policies:
+        head = f"ours-{short}-" if short else "ours-"
+        for mm in margins[policy]:
+            yield Contender(
+                f"{head}m{mm}", f"{mm} mm", f"ours, margin ({words})", "vprism", policy,
+                ((mm / 1000.0, None),),
+            )  # fmt: skip
+        for risk in risks[policy]:
+            yield Contender(
+                f"{head}r{round(100 * risk):02d}", f"risk {risk:g}", f"ours, risk ({words})",
+                "vprism", policy, ((0.0, risk),),
+            )  # fmt: skip
+    steps = tuple((margin, None) for margin in _LADDER)
+    yield Contender(
+        "ours-widest", "widest margin that works", "ours, widest margin", "vprism", "free", steps
+    )
+
+
+_LADDER = (0.02, 0.01, 0.005, 0.0)  # metres
+CONTENDERS: dict[str, Contender] = {
+    entry.key: entry
+    for entry in (
+        Contender("truth", "the truth itself", "truth", "truth"),
+        *_ours(),
+        Contender("fcl", "meshes with FCL", "meshes with FCL", "vprism", meshes=True),
+        Contender(
+            "fcl-m10", "10 mm", "meshes with FCL", "vprism", bounds=((0.01, None),), meshes=True
+        ),
+        Contender("points", "point cloud", "points", "points"),
+        Contender("octomap-free", "OctoMap, unknown free", "octomap-free", "octomap"),
+        Contender(
+            "octomap-occupied", "OctoMap, unknown occupied", "octomap-occupied", "octomap",
+            "occupied",
+        ),
+        Contender("sgd", "SGD point estimate", "sgd", "sgd"),
+    )
+}  # fmt: skip
+
+
+def contenders(keys: Iterable[str] | None = None) -> tuple[Contender, ...]:
+    """Return the contenders of these keys (all if None); ConfigError naming the keys."""
+    chosen = tuple(CONTENDERS) if keys is None else tuple(keys)
+    for key in chosen:
+        if key not in CONTENDERS:
+            raise ConfigError(f"there is no checker {key!r}; valid: {', '.join(CONTENDERS)}")
+    return tuple(CONTENDERS[key] for key in chosen)
+
+
+class Bench:
+    """One scene's worlds and checkers; what contenders share is built once.
+
+    Args:
+        scene: what the camera saw is all that checkers get of it.
+        robot: who moves.
+        seed: of the maps.
+        truth: the true world, for the contender "truth".
+
+    Attributes:
+        seconds: processor time that each part took.
+    """
+
+    def __init__(
+        self, scene: TrueScene, robot: Robot, seed: int, truth: GridWorld | None = None
+    ) -> None:
+        self.scene = scene
+        self.observation = scene.observation
+        self.robot = robot
+        self.seed = seed
+        self.truth = truth
+        self.seconds: dict[str, float] = {}
+        self._worlds: dict[tuple[str, str], Any] = {}
+
+    def checkers(self, contender: Contender) -> tuple[list[Any], float]:
+        """Return a contender's checkers, one per bound, and the processor seconds they took
+        from the observation on, what others made before included."""
+        name = f"world {contender.map} {contender.occluded}"
+        world = self._world(contender, name)
+        began = time.process_time()
+        made = [self._make(contender, world, *bound) for bound in contender.bounds]
+        spent = time.process_time() - began
+        parts = (f"map {contender.map}", name)
+        return made, spent + sum(self.seconds.get(part, 0.0) for part in parts)
+
+    def _make(self, contender: Contender, world: Any, margin: float, risk: float | None) -> Any:
+        if contender.meshes:
+            from vprism_plan.evaluation.planning_benchmark.fcl_checker import FclChecker
+
+            return FclChecker(world, self.robot.with_padding(margin) if margin else self.robot)
+        # 256 worlds without a collision cannot show a risk below 0.0148.
+        draws = 512 if risk is not None and risk < 0.015 else 256
+        config = CheckerConfig(margin=margin, max_risk=risk, n_worlds=draws)
+        return CollisionChecker(world, self.robot, config)
+
+    def _world(self, contender: Contender, name: str) -> Any:
+        key = (contender.map, contender.occluded)
+        if key not in self._worlds:
+            if contender.map in ("vprism", "sgd"):
+                map_ = self.vprism if contender.map == "vprism" else self.sgd
+                config = WorldConfig(
+                    occluded=contender.occluded, bounds=benchmark_bounds(self.observation)
+                )
+                make: Callable[[], Any] = lambda: World(map_, config)  # noqa: E731
+            elif contender.map == "points":
+                make = self.point_world
+            elif contender.map == "octomap":
+                tree = self.octomap
+                make = lambda: self.octomap_world(tree, contender.occluded)  # noqa: E731
+            elif contender.map == "truth" and self.truth is not None:
+                return self.truth
+            else:
+                raise ConfigError(f"contender {contender.key!r} has no world here")
+            self._worlds[key] = self._timed(name, make)
+        return self._worlds[key]
+
+    def _timed(self, name: str, make: Callable[[], Any]) -> Any:
+        began = time.process_time()
+        made = make()
+        self.seconds[name] = time.process_time() - began
+        return made
+
+    @cached_property
+    def vprism(self) -> Any:
+        """The map of the default preset."""
+        return self._timed("map vprism", lambda: method("vprism").fit(self.observation, self.seed))
+
+    @cached_property
+    def sgd(self) -> Any:
+        """The point estimate: a map whose posterior has no width."""
+        return self._timed("map sgd", lambda: method("sgd").fit(self.observation, self.seed))
+
+    @cached_property
+    def octomap(self) -> Any:
+        """The octree."""
+        fit = method("octomap").fit
+        return self._timed("map octomap", lambda: fit(self.observation, self.seed))
+
+    def point_world(self) -> GridWorld:
+        """Return the observed points off the table, each as large as the sensor is uncertain.
+
+        A point marks the 5 mm cells within three standard deviations of the depth noise
+        at its range, and at least half its pixel's width. Flying pixels are left out as
+        our map leaves them out. All else is free.
+        """
+        grid = benchmark_grid(self.observation)
+        lattice = empty_lattice(grid, _CELLS)
+        points, labels, depth = self._things()
+        focal = min(self.observation.intrinsics[0, 0], self.observation.intrinsics[1, 1])
+        half = np.maximum(3.0 * depth_sigma(depth), 0.5 * depth / focal)
+        ids = [int(i) for i in np.unique(labels)]
+        names = [f"object:{i}" if i > 0 else "background" for i in ids]
+        for number, own in enumerate(ids, start=1):
+            chosen = labels == own
+            kernels.mark_boxes(
+                np.ascontiguousarray(points[chosen]), half[chosen], grid.origin,
+                grid.spacing / _CELLS, np.uint8(number), lattice.labels,
+            )  # fmt: skip
+        return world_of_lattice(lattice, grid, names, self.observation)
+
+    def _things(
+        self,
+    ) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, Float[np.ndarray, " n"]]:
+        """Points (m) off the table, their labels and depths (m); flying pixels left out."""
+        view = self.observation
+        points, labels = view.points()
+        keep = labels > 0
+        for own in np.unique(labels[keep]):
+            rows = np.flatnonzero(labels == own)
+            keep[rows] = ~stray_points(points[rows], _STRAYS)
+        others, _ = background_points([view], support_plane(view), _OFF_TABLE)
+        points = np.concatenate([points[keep], others])
+        labels = np.concatenate([labels[keep], np.zeros(len(others), dtype=labels.dtype)])
+        return points, labels, (points - view.camera_center) @ view.pose[:3, 2]
+
+    def octomap_world(self, tree: Any, occluded: OccludedPolicy) -> GridWorld:
+        """Return an octree's occupied cells and, if asked, its unknown ones in the image.
+
+        Its cells are centred on the nodes of the grid. Occupied ones that lie on the support
+        and show no object are the support's; unknown ones outside the image are free, as
+        they are for us.
+        """
+        grid = benchmark_grid(self.observation)
+        plane = support_plane(self.observation)
+        lattice = empty_lattice(grid, _CELLS)
+        points = self.observation.points()[0]
+        cells = np.unique(np.round(points / tree.cell).astype(np.int64), axis=0)
+        inside = ((cells >= grid.first) & (cells < grid.first + grid.shape)).all(axis=1)
+        cells = cells[inside]
+        cells = cells[tree.state(cells * tree.cell) == OCTOMAP_OCCUPIED]
+        shown = tree.predict_proba(cells * tree.cell)[:, 1:].sum(axis=1) > 0.0
+        cells = cells[shown | (plane.signed_distance(cells * tree.cell) > _OFF_TABLE)]
+        if occluded == "occupied":
+            nodes = np.argwhere(~known_nodes(tree, grid))
+            centers = grid.spacing * (nodes + grid.first)
+            nodes = nodes[plane.signed_distance(centers) > 0.5 * tree.cell]
+            nodes = nodes[self._in_image(grid.spacing * (nodes + grid.first))]
+            mark_cells(lattice, nodes, 1)
+        mark_cells(lattice, cells - grid.first, 2)
+        return world_of_lattice(lattice, grid, ("occluded", "background"), self.observation)
+
+    def _in_image(self, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
+        """Whether world points (m) project into the image."""
+        view = self.observation
+        local = (points - view.camera_center) @ view.pose[:3, :3]
+        front = local[:, 2] > 0.0
+        scale = np.where(front, local[:, 2], 1.0)
+        K = view.intrinsics
+        u = K[0, 0] * local[:, 0] / scale + K[0, 2]
+        v = K[1, 1] * local[:, 1] / scale + K[1, 2]
+        height, width = view.depth.shape
+        return front & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+
+
+def mark_cells(lattice: Lattice, nodes: Int[np.ndarray, "n 3"], label: int) -> None:
+    """Mark cells as wide as the grid's step, centred on its nodes."""
+    for shift in np.ndindex(3, 3, 3):
+        at = _CELLS * nodes + np.array(shift) - 1
+        at = np.clip(at, 0, np.array(lattice.labels.shape) - 1)
+        lattice.labels[tuple(at.T)] = label
+
+
+def known_nodes(tree: Any, grid: Grid) -> Bool[np.ndarray, "nx ny nz"]:
+    """Return which nodes lie in a leaf of an octree (cells centred on nodes), free or not."""
+    if not np.isclose(tree.cell, grid.spacing):
+        raise ConfigError(f"the octree has cells of {tree.cell} m, the grid of {grid.spacing} m")
+    rows = [(*leaf.getCoordinate(), leaf.getSize()) for leaf in tree.tree.begin_leafs()]
+    leaves = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    width = np.round(leaves[:, 3] / tree.cell).astype(np.int64)
+    # The tree's own frame is shifted by half a cell: its corners are whole cells there.
+    corner = np.round((leaves[:, :3] - 0.5 * leaves[:, 3:]) / tree.cell).astype(np.int64)
+    first = corner - grid.first
+    known = np.zeros(grid.shape, dtype=np.bool_)
+    low = np.clip(first, 0, grid.shape)
+    high = np.clip(first + width[:, None], 0, grid.shape)
+    single = (width == 1) & (high > low).all(axis=1)
+    known[tuple(low[single].T)] = True
+    for a, b in zip(low[width > 1].tolist(), high[width > 1].tolist(), strict=True):
+        known[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = True
+    return known
