@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.errors import ConfigError
+from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.evaluation.protocols import Reconstruction
 from vprism_plan.world.config import check_level
 from vprism_plan.world.meshes import surface
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _CHUNK = 1 << 16
 _MAX_NODES = 20_000_000
+_RISES = (0.0, 0.003, 0.01, 0.03)  # probability
 
 
 def meshes_of(
@@ -57,10 +58,27 @@ def meshes_of(
     probabilities = _sample(reconstruction, first, shape, resolution)
     found = {}
     for k, object_id in enumerate(reconstruction.object_ids, start=1):
-        mesh = surface(probabilities[..., k] - np.float32(level), resolution * first, resolution)
+        mesh = _closed(probabilities[..., k] - np.float32(level), resolution * first, resolution)
         if mesh is not None:
             found[int(object_id)] = mesh
     return found
+
+
+def _closed(
+    inside: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, " 3"], resolution: float
+) -> "trimesh.Trimesh | None":
+    """Surface around {inside > 0}; None if there is none.
+
+    Where voxels that are all or nothing meet in an edge, the trilinear surface crosses
+    itself and no choice of triangles closes it: a slightly higher level keeps them apart.
+    """
+    for rise in _RISES:
+        try:
+            return surface(inside - np.float32(rise), origin, resolution)
+        except WorldError:
+            if rise == _RISES[-1]:
+                raise
+    return None
 
 
 def _box(

@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from vprism_plan._kernels import rays
 from vprism_plan.evaluation.baselines._common import checked_points, counts_per_voxel, one_hot
@@ -65,27 +65,40 @@ def fit(observation: Observation, seed: int, edge: float = VOXEL) -> VoxelRecons
         ObservationError: no labels or no objects.
         PlaneNotFoundError: no support plane is known and none can be fitted.
     """
-    from scipy.ndimage import distance_transform_edt
-
     object_ids = observation.require_objects()
-    plane = (
-        observation.plane if observation.plane is not None else fit_plane(observation, seed=seed)
-    )
+    plane = observation.plane or fit_plane(observation, seed=seed)
+    first, classes, observed = observed_voxels(observation, edge)
+    return VoxelReconstruction(object_ids, plane, first, edge, filled(classes, observed))
+
+
+def observed_voxels(
+    observation: Observation, edge: float
+) -> tuple[Int[np.ndarray, " 3"], Int[np.ndarray, "nx ny nz"], Bool[np.ndarray, "nx ny nz"]]:
+    """Return the grid's first index, the classes of its voxels, and which were observed."""
     points, labels = _trusted_points(observation)
     own = points[labels > 0]
     first = np.floor((own.min(axis=0) - REACH) / edge).astype(np.int64)
-    shape = np.ceil((own.max(axis=0) + REACH) / edge).astype(np.int64) + 1 - first
-    classes = np.zeros(tuple(shape), dtype=np.int64)
-    observed = np.zeros(tuple(shape), dtype=bool)
+    last = np.ceil((own.max(axis=0) + REACH) / edge).astype(np.int64)
+    shape = tuple((last + 1 - first).tolist())
+    observed = np.zeros(shape, dtype=bool)
     rays.mark_passed(points, observation.camera_center, edge * (first - 0.5), edge, observed)
-    most = np.zeros(tuple(shape), dtype=np.int64)
-    for k, object_id in enumerate(object_ids, start=1):
-        count = counts_per_voxel(points[labels == object_id], first, edge, tuple(shape))
+    classes = np.zeros(shape, dtype=np.int64)
+    most = np.zeros(shape, dtype=np.int64)
+    for k, object_id in enumerate(observation.object_ids, start=1):
+        count = counts_per_voxel(points[labels == object_id], first, edge, shape)
         chosen = count > most
         classes[chosen], most[chosen] = k, count[chosen]
-    observed |= most > 0
+    return first, classes, observed | (most > 0)
+
+
+def filled(
+    classes: Int[np.ndarray, "nx ny nz"], observed: Bool[np.ndarray, "nx ny nz"]
+) -> Int[np.ndarray, "nx ny nz"]:
+    """Return the classes with unobserved voxels as the nearest observed one."""
+    from scipy.ndimage import distance_transform_edt
+
     nearest = distance_transform_edt(~observed, return_distances=False, return_indices=True)
-    return VoxelReconstruction(object_ids, plane, first, edge, classes[tuple(nearest)])
+    return np.asarray(classes[tuple(nearest)])
 
 
 def _trusted_points(
