@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Train the learned baseline that the package carries.
 
-    python benchmarks/train_pointsdf.py [--solids 240] [--meshes 180] [--steps 4000] [--output FILE]
+    python benchmarks/train_pointsdf.py [--solids 180] [--meshes 120] [--steps 1600] [--output FILE]
 
 Arrangements of solids and of dropped meshes (objects 000 to 359 of those that pybullet brings;
 360 to 399 are held out for validation), several views of each, go to build/pointsdf/ in parts
@@ -41,6 +41,7 @@ FIRST_SEED, HELD_OUT_SEED = 100_000, 190_000
 HELD_OUT_OBJECT = 360  # of random-train; from here on objects are for validation
 SOLID_VIEWS, MESH_VIEWS = 3, 4
 QUERIES, UNIFORM_QUERIES = 512, 1024
+MOST_VALIDATED = 160  # examples per validation set
 Parts = tuple[Examples | None, Examples | None]  # to learn from, to validate
 
 
@@ -97,6 +98,12 @@ def collected(
     return learn, validate
 
 
+def thinned(examples: Examples) -> Examples:
+    """Return at most MOST_VALIDATED examples, evenly out of all."""
+    count = min(len(examples), MOST_VALIDATED)
+    return examples.subset(np.arange(count) * len(examples) // count)
+
+
 def said(look: Look, started: float) -> str:
     """One line of progress."""
     sets = ", ".join(
@@ -139,8 +146,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--solids", type=int, default=240, help="arrangements of solids")
-    parser.add_argument("--meshes", type=int, default=180, help="drops of meshes; 0: none")
+    parser.add_argument("--solids", type=int, default=180, help="arrangements of solids")
+    parser.add_argument("--meshes", type=int, default=120, help="drops of meshes; 0: none")
     parser.add_argument(
         "--validation", type=int, default=20, help="held-out arrangements of solids"
     )
@@ -158,6 +165,7 @@ def main() -> None:
         more, unseen = collected("meshes", meshes, drops, args.data)
         learn += more
         validation["meshes"] = Examples.joined(unseen)
+    validation = {name: thinned(part) for name, part in validation.items()}
     examples = Examples.joined(learn)
     sizes = {name: len(part) for name, part in validation.items()}
     print(f"{len(examples)} examples to learn from, validation {sizes}", flush=True)

@@ -27,12 +27,14 @@ class PointSdfReconstruction:
     Attributes:
         object_ids: labels, in the order of the columns 1 to C.
         frames: where the network's coordinates of each object lie.
-        embeddings: (C, e) of the objects' clouds.
+        clouds: (C, n, 3) what was seen of each object, in its frame.
+        embeddings: (C, e) of the clouds.
         model: the network.
     """
 
     object_ids: tuple[int, ...]
     frames: tuple[ObjectFrame, ...]
+    clouds: torch.Tensor
     embeddings: torch.Tensor
     model: PointSDF
 
@@ -59,7 +61,9 @@ class PointSdfReconstruction:
             for start in range(0, len(rows), _CHUNK):
                 part = slice(start, start + _CHUNK)
                 with torch.no_grad():
-                    logit = self.model.answer(self.embeddings[k : k + 1], asked[None, part])
+                    logit = self.model.answer(
+                        self.embeddings[k : k + 1], self.clouds[k : k + 1], asked[None, part]
+                    )
                 proba[rows[part], 1 + k] = torch.sigmoid(logit[0].double()).numpy()
         proba[:, 0] = (1.0 - proba[:, 1:]).prod(axis=1)
         return proba
@@ -92,6 +96,7 @@ def reconstruct(
         clouds.append(cloud)
         frames.append(frame)
     contexts = np.stack([frame.context for frame in frames])
+    stacked = torch.from_numpy(np.stack(clouds))
     with torch.no_grad():
-        embeddings = model.embed(torch.from_numpy(np.stack(clouds)), torch.from_numpy(contexts))
-    return PointSdfReconstruction(ids, tuple(frames), embeddings, model)
+        embeddings = model.embed(stacked, torch.from_numpy(contexts))
+    return PointSdfReconstruction(ids, tuple(frames), stacked, embeddings, model)

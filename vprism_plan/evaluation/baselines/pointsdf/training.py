@@ -39,7 +39,7 @@ class Schedule:
         seed: of the weights, the order of the examples and their variation.
     """
 
-    steps: int = 4000
+    steps: int = 1600
     batch: int = 32
     queries: int = 160
     rate: float = 2e-3
@@ -48,7 +48,7 @@ class Schedule:
     average: float = 0.998
     turn: float = 8.0
     stretch: float = 0.1
-    check_every: int = 250
+    check_every: int = 200
     patience: int = 6
     seed: int = 0
 
