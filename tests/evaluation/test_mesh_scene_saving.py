@@ -1,0 +1,121 @@
+"""Scenes on disk in BOP's layout: the same bits back, and no truth for those who plan."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+from oracles.scene_digest import digest
+
+from vprism_plan.errors import ObservationError
+from vprism_plan.evaluation import Camera
+from vprism_plan.evaluation.generation import MeshScene, generate, load_scene
+from vprism_plan.evaluation.scene_io import GROUND_TRUTH
+from vprism_plan.perception import load_observation
+
+
+@pytest.fixture(scope="module", params=[("analytic", True), ("random", False)], ids=str)
+def scene(request):
+    kind, noise = request.param
+    return generate(kind, 6, n_objects=3, noise=noise)
+
+
+def same_observation(a, b) -> None:
+    for name in ("depth", "labels", "intrinsics", "T_world_camera", "color"):
+        left, right = getattr(a, name), getattr(b, name)
+        assert left.dtype == right.dtype, name
+        assert left.tobytes() == right.tobytes(), name
+
+
+def test_a_saved_scene_reloads_identically(scene, tmp_path):
+    scene.save(tmp_path / "scene")
+    again = load_scene(tmp_path / "scene")
+    assert digest(again) == digest(scene)
+    for name in ("name", "seed", "noise", "kind"):
+        assert getattr(again, name) == getattr(scene, name)
+    same_observation(again.observation, scene.observation)
+    points = np.random.default_rng(0).uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 0.2], (500, 3))
+    np.testing.assert_array_equal(again.object_of(points), scene.object_of(points))
+    np.testing.assert_array_equal(again.signed_distance(points), scene.signed_distance(points))
+    again.save(tmp_path / "again")
+    for path in sorted((tmp_path / "scene").rglob("*.*")):
+        twin = tmp_path / "again" / path.relative_to(tmp_path / "scene")
+        assert twin.read_bytes() == path.read_bytes(), path.name
+
+
+def test_planners_read_the_same_observation_and_no_truth(scene, tmp_path):
+    folder = tmp_path / "scene"
+    scene.save(folder)
+    same_observation(load_observation(folder), scene.observation)
+    for truth in (GROUND_TRUTH, "scene_gt.json"):
+        (folder / truth).unlink()
+    shutil.rmtree(folder / "models")
+    same_observation(load_observation(folder), scene.observation)
+
+
+def test_bop_tools_find_the_models_where_the_camera_sees_them(scene, tmp_path):
+    scene.save(tmp_path)
+    poses = json.loads((tmp_path / "scene_gt.json").read_text())["0"]
+    info = json.loads((tmp_path / "models" / "models_info.json").read_text())
+    seen = load_observation(tmp_path)
+    to_world = seen.T_world_camera
+    for entry, mesh in zip(poses, scene.truth_meshes().values(), strict=True):
+        model = trimesh.load_mesh(
+            tmp_path / "models" / f"obj_{entry['obj_id']:06d}.ply", process=False
+        )
+        rotation = np.reshape(entry["cam_R_m2c"], (3, 3))
+        in_camera = 0.001 * (model.vertices @ rotation.T + entry["cam_t_m2c"])
+        np.testing.assert_allclose(
+            in_camera @ to_world[:3, :3].T + to_world[:3, 3], mesh.vertices, atol=1e-7
+        )
+        about = info[str(entry["obj_id"])]
+        assert [about[f"size_{axis}"] for axis in "xyz"] == pytest.approx(model.extents, abs=1e-3)
+        corners = model.vertices[trimesh.convex.ConvexHull(model.vertices).vertices]
+        apart = np.linalg.norm(corners[:, None] - corners[None], axis=2).max()
+        assert about["diameter"] == pytest.approx(apart, abs=1e-6)
+
+
+def test_a_camera_that_was_not_rounded_reloads_to_the_bit_too(scene, tmp_path):
+    camera = Camera.orbit(np.array([0.01, 0.02, 0.03]), 0.9, 1.234567, 0.6543)
+    moved = MeshScene(scene.objects, camera, scene.render(camera))
+    moved.save(tmp_path)
+    assert digest(load_scene(tmp_path)) == digest(moved)
+
+
+def test_a_scene_replaces_a_scene_but_nothing_else(scene, tmp_path):
+    target = tmp_path / "scene"
+    scene.save(target)
+    fewer = MeshScene(scene.objects[:2], scene.camera, scene.observation)
+    fewer.save(target)
+    assert len(load_scene(target).objects) == 2
+    assert len(list((target / "mask_visib").iterdir())) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+    other = tmp_path / "thesis"
+    other.mkdir()
+    (other / "draft.txt").write_text("years of work")
+    with pytest.raises(ObservationError, match="is no mesh scene"):
+        scene.save(other)
+    assert (other / "draft.txt").read_text() == "years of work"
+    with pytest.raises(ObservationError, match="is no mesh scene"):
+        scene.save(other / "draft.txt")
+
+
+def test_damage_is_named(scene, tmp_path):
+    with pytest.raises(ObservationError, match=r"ground_truth\.json does not exist"):
+        load_scene(tmp_path)
+    scene.save(tmp_path)
+    model = tmp_path / "models" / "obj_000002.ply"
+    model.write_bytes(b"ply\n")
+    with pytest.raises(ObservationError, match=r"obj_000002\.ply is not a readable"):
+        load_scene(tmp_path)
+    model.unlink()
+    with pytest.raises(ObservationError, match=r"obj_000002\.ply is missing"):
+        load_scene(tmp_path)
+    truth = tmp_path / GROUND_TRUTH
+    truth.write_text(truth.read_text().replace("version 1", "version 9"))
+    with pytest.raises(ObservationError, match="version 9"):
+        load_scene(tmp_path)
+    truth.write_text("{")
+    with pytest.raises(ObservationError, match="not readable JSON"):
+        load_scene(tmp_path)
