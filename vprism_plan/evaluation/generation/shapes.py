@@ -46,8 +46,7 @@ class Shape:
         """Volume as a share of the convex hull's; small for thin shells and lattices."""
         from scipy.spatial import ConvexHull
 
-        a, b, c = self.vertices[self.faces].transpose(1, 0, 2)
-        volume = float((a * np.cross(b, c)).sum()) / 6.0
+        volume = _volume(self.vertices, self.faces)
         return volume / float(ConvexHull(self.vertices[self.hull]).volume)
 
     def scaled(self, factor: float) -> "Shape":
@@ -70,6 +69,12 @@ def to_millimetres(vertices: np.ndarray) -> np.ndarray:
 def from_millimetres(vertices: np.ndarray) -> np.ndarray:
     """Return metres of float32 millimetres."""
     return vertices.astype(np.float64) * _MILLIMETRE
+
+
+def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Return the enclosed volume, negative inside out (trimesh's divides by it, and warns)."""
+    a, b, c = (vertices - vertices.mean(axis=0))[faces].transpose(1, 0, 2)
+    return float((a * np.cross(b, c)).sum()) / 6.0
 
 
 @lru_cache(maxsize=2048)
@@ -118,19 +123,29 @@ def shape_of(mesh: "trimesh.Trimesh", name: str) -> Shape:
 
 
 def _outer_surface(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """Merge corners, unite the pieces, and turn an inside-out mesh."""
+    """Unite closed pieces, or merge corners; turn an inside-out mesh."""
     import trimesh
 
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    mesh.merge_vertices()
-    mesh.update_faces(mesh.nondegenerate_faces())
-    mesh.remove_unreferenced_vertices()
-    pieces = mesh.split(only_watertight=False)
-    if len(pieces) > 1 and all(p.is_watertight and p.volume > 0 for p in pieces):
+    # Corners that two pieces have in common must stay two, or the pieces hang together.
+    pieces = _closed_pieces(mesh)
+    if not pieces:
+        mesh.merge_vertices()
+        mesh.update_faces(mesh.nondegenerate_faces())
+        mesh.remove_unreferenced_vertices()
+        pieces = _closed_pieces(mesh)
+    if len(pieces) > 1:
         for piece in pieces:
             middle = piece.bounds.mean(axis=0)
             piece.vertices = (piece.vertices - middle) * _SEAM + middle
         mesh = trimesh.boolean.union(pieces, check_volume=False)
-    if mesh.volume < 0:
+    if _volume(mesh.vertices, mesh.faces) < 0:
         mesh.invert()
     return mesh
+
+
+def _closed_pieces(mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
+    """Return the connected pieces if all of them are closed and right side out, else none."""
+    pieces = list(mesh.split(only_watertight=False))
+    closed = all(p.is_watertight and _volume(p.vertices, p.faces) > 0 for p in pieces)
+    return pieces if closed else []
