@@ -7,7 +7,6 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +159,8 @@ def _uncertainty(
     command: Eval, kinds: tuple[str, ...], scenes: int, store: Path, output: Path
 ) -> Report:
     """Compare V-PRISM's uncertainty with a point estimate's."""
-    run = import_module("vprism_plan.evaluation.experiments.uncertainty").run
+    from vprism_plan.evaluation.experiments.uncertainty import run
+
     figures, files = run(
         kinds, scenes, command.first_seed, data=command.data, store=store / "uncertainty",
         output=output, jobs=command.jobs, backend=command.backend, cluster=command.cluster,

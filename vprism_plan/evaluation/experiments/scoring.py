@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.evaluation import baselines
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments.store import Case
 from vprism_plan.evaluation.protocols import Reconstruction, TrueScene
@@ -30,6 +31,9 @@ _PRESETS = {
     "vprism": MapConfig, "sgd": MapConfig, "sigmoid": MapConfig, "vprism-fine": MapConfig.fine,
 }  # fmt: skip
 
+# Trained, and so may be trained again; found without importing torch.
+_WEIGHTS = Path(baselines.__file__).parent / "pointsdf" / "weights.safetensors"
+
 
 def method_question(key: str) -> dict[str, Any]:
     """Return what the answers of a method depend on besides the scene."""
@@ -39,6 +43,8 @@ def method_question(key: str) -> dict[str, Any]:
     }  # fmt: skip
     if key in _PRESETS:
         question["config"] = asdict(_PRESETS[key]())
+    if key == "pointsdf" and _WEIGHTS.is_file():  # without them the fit says how to get them
+        question["weights"] = hashlib.sha256(_WEIGHTS.read_bytes()).hexdigest()[:16]
     return question
 
 
