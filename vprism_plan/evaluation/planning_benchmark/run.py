@@ -226,10 +226,7 @@ def _known(judged: PathTruth, bench: Bench) -> str:
 
 def tip_travel(truth: Truth, path: Float[np.ndarray, "t dof"]) -> float:
     """Return the way of the finger tip along a path, metres, from samples every centimetre."""
-    from vprism_plan.collision._travel import edges_of
-
-    checker: Any = truth
-    Q, _ = edges_of(checker, path).samples(0.005)
+    Q, _ = truth.edges(path).samples(0.005)
     tips = truth.sphere_centers(Q, np.array([tip_sphere(truth.robot)]))[:, 0]
     return float(np.linalg.norm(np.diff(tips, axis=0), axis=1).sum())
 

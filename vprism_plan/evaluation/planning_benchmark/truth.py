@@ -8,13 +8,14 @@ says of the depth is at most 1 mm short.
 """
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.collision import CollisionChecker
-from vprism_plan.collision._travel import edges_of, place_points
+from vprism_plan.collision._travel import Edges, edges_of, place_points
 from vprism_plan.evaluation.planning_benchmark.grid_world import (
     benchmark_grid,
     checker_of,
@@ -141,14 +142,22 @@ class Truth:
         """Return a checker whose world is the true one: what it accepts is really free."""
         return checker_of(self.world, self.robot, margin)
 
+    @cached_property
+    def exact(self) -> CollisionChecker:
+        """The checker of the true world without a margin."""
+        return self.checker()
+
+    def edges(self, path: Float[np.ndarray, "t dof"]) -> Edges:
+        """Return the edges of a path (T, dof), and how far they can move anything."""
+        return edges_of(self.exact, path)
+
     def judge(self, path: Float[np.ndarray, "t dof"]) -> PathTruth:
         """Return how near a path (T, dof) comes to the true objects and the table.
 
         Raises:
             RobotError: the path has a wrong shape or values that are not finite.
         """
-        asked: Any = self  # of which `edges_of` reads the robot alone
-        edges = edges_of(asked, path)
+        edges = self.edges(path)
         Q, places = edges.samples(TOLERANCE)
         radii = np.asarray(self.robot.sphere_radii)[self._spheres]
         best = _Nearest()
