@@ -73,16 +73,23 @@ class Contender:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Contender":
-        """Rebuild from `to_dict`."""
-        return cls(**{**data, "bounds": tuple((m, r) for m, r in data["bounds"])})
+        """Rebuild from `to_dict`, or from `question`."""
+        words = {"label": data["key"], "line": data["key"]}
+        return cls(**{**words, **data, "bounds": tuple((m, r) for m, r in data["bounds"])})
+
+    def question(self) -> dict[str, Any]:
+        """Return what its answers depend on: all but how it is called in tables."""
+        data = self.to_dict()
+        del data["label"], data["line"]
+        return data
 
 
 def _ours() -> Iterable[Contender]:
     """Level sets with margins and bounds on risk, by what occluded space is taken for."""
     policies: tuple[tuple[OccludedPolicy, str, str], ...] = (
-        ("occupied", "all", "occluded: obstacle"),
-        ("posterior", "beyond", "occluded: obstacle beyond support"),
-        ("free", "", "occluded: the map decides"),
+        ("occupied", "all", "hidden: obstacle"),
+        ("posterior", "beyond", "hidden: obstacle beyond support"),
+        ("free", "", "hidden: the map decides"),
     )
     margins = {"occupied": (0,), "posterior": (0, 10), "free": (0, 5, 10, 20, 30)}
     risks = {"occupied": (), "posterior": (0.05,), "free": (0.01, 0.05, 0.2, 0.5)}
@@ -100,7 +107,12 @@ def _ours() -> Iterable[Contender]:
             )  # fmt: skip
     steps = tuple((margin, None) for margin in _LADDER)
     yield Contender(
-        "ours-widest", "widest margin that works", "ours, widest margin", "vprism", "free", steps
+        "ours-widest",
+        "ours, widest margin that works",
+        "ours, widest margin that works",
+        "vprism",
+        "free",
+        steps,
     )
 
 
@@ -110,9 +122,10 @@ CONTENDERS: dict[str, Contender] = {
     for entry in (
         Contender("truth", "the truth itself", "truth", "truth"),
         *_ours(),
-        Contender("fcl", "meshes with FCL", "meshes with FCL", "vprism", meshes=True),
+        Contender("fcl", "plain", "meshes with FCL", "vprism", meshes=True),
         Contender(
-            "fcl-m10", "10 mm", "meshes with FCL", "vprism", bounds=((0.01, None),), meshes=True
+            "fcl-m10", "links padded by 10 mm", "meshes with FCL", "vprism",
+            bounds=((0.01, None),), meshes=True,
         ),
         Contender("points", "point cloud", "points", "points"),
         Contender("octomap-free", "OctoMap, unknown free", "octomap-free", "octomap"),
@@ -132,6 +145,13 @@ def contenders(keys: Iterable[str] | None = None) -> tuple[Contender, ...]:
         if key not in CONTENDERS:
             raise ConfigError(f"there is no checker {key!r}; valid: {', '.join(CONTENDERS)}")
     return tuple(CONTENDERS[key] for key in chosen)
+
+
+def full_label(contender: Contender) -> str:
+    """Return a contender's name where its line does not stand beside it."""
+    if contender.line in (contender.label, contender.key):
+        return contender.label
+    return f"{contender.line}, {contender.label}"
 
 
 class Bench:
@@ -262,20 +282,18 @@ class Bench:
     def octomap_world(self, tree: Any, occluded: OccludedPolicy) -> GridWorld:
         """Return an octree's occupied cells and, if asked, its unknown ones in the image.
 
-        Its cells are centred on the nodes of the grid. Occupied ones that lie on the support
-        and show no object are the support's; unknown ones outside the image are free, as
-        they are for us.
+        Its cells are centred on the nodes of the grid. Occupied ones count that hold a point
+        off the support which is no flying pixel, as for the point cloud; unknown ones outside
+        the image are free, as they are for us.
         """
         grid = benchmark_grid(self.observation)
         plane = support_plane(self.observation)
         lattice = empty_lattice(grid, _CELLS)
-        points = self.observation.points()[0]
+        points = self._things()[0]
         cells = np.unique(np.round(points / tree.cell).astype(np.int64), axis=0)
         inside = ((cells >= grid.first) & (cells < grid.first + grid.shape)).all(axis=1)
         cells = cells[inside]
         cells = cells[tree.state(cells * tree.cell) == OCTOMAP_OCCUPIED]
-        shown = tree.predict_proba(cells * tree.cell)[:, 1:].sum(axis=1) > 0.0
-        cells = cells[shown | (plane.signed_distance(cells * tree.cell) > _OFF_TABLE)]
         if occluded == "occupied":
             nodes = np.argwhere(~known_nodes(tree, grid))
             centers = grid.spacing * (nodes + grid.first)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vprism_plan._files import write_text
+from vprism_plan.evaluation.planning_benchmark.checkers import full_label
 from vprism_plan.evaluation.planning_benchmark.run import Answer, Limits
 from vprism_plan.evaluation.planning_benchmark.summary import Outcome
 
@@ -68,7 +69,7 @@ def log_text(found: Sequence[Outcome], name: str, limits: Limits, setup: str, da
     ]  # fmt: skip
     for outcome in found:
         lines += [
-            f"{outcome.contender.line}: {outcome.contender.label}".replace("|", "/"),
+            full_label(outcome.contender).replace("|", "/"),
             "2 common properties",
             f"key = {outcome.contender.key}",
             f"planner = {limits.planner}",

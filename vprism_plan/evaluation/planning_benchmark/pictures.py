@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vprism_plan.evaluation.planning_benchmark.summary import OURS, REFERENCE, Outcome, front
+from vprism_plan.evaluation.planning_benchmark.checkers import full_label
+from vprism_plan.evaluation.planning_benchmark.summary import OURS, Outcome, front
 from vprism_plan.viz._figures import new_figure
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ def curve_figure(found: Sequence[Outcome]) -> "Figure":
     figure = new_figure(11.0, 7.0)
     axes = figure.add_subplot()
     lines: dict[str, list[Outcome]] = {}
+    words = {outcome.contender.line: _words(outcome) for outcome in found}
     for outcome in found:
         lines.setdefault(outcome.contender.line, []).append(outcome)
     ours = [line for line, own in lines.items() if own[0].contender.key.startswith(OURS)]
@@ -39,7 +41,7 @@ def curve_figure(found: Sequence[Outcome]) -> "Figure":
             color, marker = _COLORS[ours.index(line) % len(_COLORS)], "o"
         else:
             color, marker = _OTHERS.get(own[0].contender.key, ("#555555", "x"))
-        _line(axes, line, own, color, marker)
+        _line(axes, words[line], own, color, marker)
     _hull(axes, [own for line in ours for own in lines[line]])
     axes.set_xlabel("returned paths that truly collide (%)")
     axes.set_ylabel("problems with a path (%)")
@@ -73,6 +75,12 @@ def _line(axes: "Axes", line: str, own: list[Outcome], color: str, marker: str) 
             )  # fmt: skip
 
 
+def _words(outcome: Outcome) -> str:
+    """Return what the legend calls a contender's line."""
+    contender = outcome.contender
+    return contender.label if contender.line == contender.key else contender.line
+
+
 def _hull(axes: "Axes", ours: list[Outcome]) -> None:
     """What ours reach together."""
     if not ours:
@@ -103,7 +111,7 @@ def fates_figure(found: Sequence[Outcome]) -> "Figure":
         for part, (_, color) in zip(100.0 * parts / total, _FATES, strict=True):
             axes.barh(row, part, left=left, color=color, height=0.75)
             left += part
-        names.append(full_label(outcome))
+        names.append(full_label(outcome.contender))
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_xlim(0.0, 100.0)
     axes.set_xlabel("share of all problems (%)")
@@ -114,11 +122,3 @@ def fates_figure(found: Sequence[Outcome]) -> "Figure":
         loc="outside lower center", ncols=len(_FATES), fontsize=8,
     )  # fmt: skip
     return figure
-
-
-def full_label(outcome: Outcome) -> str:
-    """Return a contender's name where its line does not stand beside it."""
-    contender = outcome.contender
-    if contender.key == REFERENCE or contender.line in (contender.label, contender.key):
-        return contender.label
-    return f"{contender.line}: {contender.label}"

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vprism_plan._files import write_text
+from vprism_plan.evaluation.planning_benchmark.checkers import full_label
 from vprism_plan.evaluation.planning_benchmark.ompl_log import write_log
 from vprism_plan.evaluation.planning_benchmark.problems import Criteria
 from vprism_plan.evaluation.planning_benchmark.run import Limits, run
@@ -190,8 +191,6 @@ def _percent(figure: dict[str, float | None]) -> str:
 
 
 def _table(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
-    from vprism_plan.evaluation.planning_benchmark.pictures import full_label
-
     lines = [
         "## Everybody", "",
         "| map and rule | success (%) | paths that collide (%) | by more than "
@@ -205,8 +204,8 @@ def _table(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
             "-" if row[name] is None else f"{row[name]:.2f}" for name in ("length", "travel")
         )
         lines.append(
-            f"| {full_label(outcome)} | {_percent(row['success'])} | {_percent(row['collision'])} "
-            f"| {_percent(row['deep'])} | {_percent(row['safe'])} "
+            f"| {full_label(outcome.contender)} | {_percent(row['success'])} "
+            f"| {_percent(row['collision'])} | {_percent(row['deep'])} | {_percent(row['safe'])} "
             f"| {1000 * row['mean_depth']:.1f}, {1000 * row['worst_depth']:.0f} "
             f"| {length} | {travel} "
             f"| {row['seconds_median']:.2f}, {row['seconds_95']:.2f} | {row['build']:.1f} |"
@@ -216,8 +215,6 @@ def _table(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
 
 def _losses(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
     """Where successes are lost, and what is hit."""
-    from vprism_plan.evaluation.planning_benchmark.pictures import full_label
-
     lines = [
         "## Where the losses come from", "", f"![What became of all problems]({KEY}-fates.png)", "",
         "Refused: the deepest contact of the refused start or goal. Hit: what was known of the "
@@ -229,7 +226,7 @@ def _losses(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
         unsolved = {k: v for k, v in row["unsolved"].items() if k != "refused"}
         hit = {_KNOWN.get(k, k): v for k, v in row["hit"].items()}
         cells = [_counts(part) for part in (row["refused"], unsolved, hit)]
-        lines.append(f"| {full_label(outcome)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {full_label(outcome.contender)} | " + " | ".join(cells) + " |")
     return [*lines, ""]
 
 
@@ -239,8 +236,6 @@ def _counts(part: dict[str, int]) -> str:
 
 
 def _sets(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
-    from vprism_plan.evaluation.planning_benchmark.pictures import full_label
-
     kinds = list(figures["sets"])
     if len(kinds) < 2:
         return []
@@ -253,7 +248,7 @@ def _sets(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
             hit = row["collision"]["value"]
             rate = "-" if hit is None else f"{100 * hit:.1f}"
             cells.append(f"{100 * (row['success']['value'] or 0.0):.1f} / {rate}")
-        lines.append(f"| {full_label(outcome)} | " + " | ".join(cells) + " |")
+        lines.append(f"| {full_label(outcome.contender)} | " + " | ".join(cells) + " |")
     return [*lines, ""]
 
 

@@ -34,7 +34,7 @@ from vprism_plan.world.visibility import OCCLUDED, SEEN, classify_points
 
 __all__ = ["Answer", "Limits", "answer_case", "problem_case", "run", "scene_of"]
 
-_VERSION = 1  # of what an answer means; counts as part of every question
+_VERSION = 2  # of what an answer means; counts as part of every question
 SOLIDS = "solids"  # analytic solids without physics: needs no optional package
 
 
@@ -295,7 +295,7 @@ def run(
         Case(
             f"{contender.key} {kind} {seed}",
             {"version": _VERSION, "kind": kind, "seed": seed, "data": folder,
-             "contender": contender.to_dict(), "limits": asdict(limits),
+             "contender": contender.question(), "limits": asdict(limits),
              "problems": problems["problems"]},
         )
         for seed, problems in zip(seeds, found, strict=True)

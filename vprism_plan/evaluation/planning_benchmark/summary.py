@@ -270,5 +270,10 @@ def _compare(ours: Sequence[Outcome], other: Outcome, asked: str) -> Statement:
     everything = np.arange(len(other.answers))
     a, b, reached = figures(everything)
     return Statement(
-        other.contender.label, asked, a, b, estimate(quotient, len(everything)), reached
+        other.contender.line if at_success else other.contender.label,
+        asked,
+        a,
+        b,
+        estimate(quotient, len(everything)),
+        reached,
     )
