@@ -23,8 +23,8 @@ _CALM = 0.1  # seconds that speeds must stay below a limit
 _CHUNK = 25  # steps between looks
 _SLOW = (0.01, 0.1)  # m/s and rad/s after which friction is made firm
 _STILL = (0.002, 0.02)  # m/s and rad/s that look like rest
-_PROOF = 0.5  # seconds for which everything, let go without speed, must then stay
-_STAYS = (0.0002, 0.005)  # metres and radians of motion that count as staying
+_PROOF = 1.0  # seconds for which everything, let go without speed, must then stay
+_STAYS = (0.0001, 0.002)  # metres and radians of motion that count as staying
 _DAMPING = np.repeat([0.1, 1e-3], 3)  # N s/m, N m s/rad: ends the rolling of round objects
 _OVERLAP = 0.0008  # metres by which hulls may press into each other and the table
 _REGION = 0.3  # metres around the middle of the pile that every object must lie within
@@ -40,7 +40,7 @@ def drop(shapes: list[Shape], rng: np.random.Generator) -> Float[np.ndarray, "n 
     Returns None when something does not come to rest within 8 simulated seconds, rolls
     farther than 30 cm from the others, or is pressed into its neighbour by more than
     0.8 mm: the caller tries again with other numbers. At rest means: released without
-    speed at these very poses, nothing moves by 0.2 mm or 0.005 rad in 0.5 s.
+    speed at these very poses, nothing moves by 0.1 mm or 0.002 rad in 1 s.
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -195,19 +195,37 @@ def _rests(mujoco: Any, model: Any, data: Any) -> bool:
     """
     mujoco.mj_forward(model, data)
     pressed = data.ncon and float(np.asarray(data.contact.dist).min()) < -_OVERLAP
-    moved, turned = _released(mujoco, model, data, _PROOF)
+    moved, turned = _released(mujoco, model, data, _PROOF, _STAYS)
     return not pressed and moved < _STAYS[0] and turned < _STAYS[1]
 
 
-def _released(mujoco: Any, model: Any, data: Any, seconds: float) -> tuple[float, float]:
-    """Let go of everything without speed; return how far it moves (m) and turns (rad)."""
-    from scipy.spatial.transform import Rotation
+def _released(
+    mujoco: Any,
+    model: Any,
+    data: Any,
+    seconds: float,
+    enough: tuple[float, float] = (np.inf, np.inf),
+) -> tuple[float, float]:
+    """Let go of everything without speed; return how far it moves (m) and turns (rad).
 
+    Ends early once something has moved or turned by `enough`.
+    """
     before = data.qpos.reshape(-1, 7).copy()
     data.qvel[:] = 0.0
     data.qacc_warmstart[:] = 0.0
-    mujoco.mj_step(model, data, round(seconds / _TIME_STEP))
-    after = data.qpos.reshape(-1, 7)
+    moved = turned = 0.0
+    for _ in range(round(seconds / (_CHUNK * _TIME_STEP))):
+        mujoco.mj_step(model, data, _CHUNK)
+        moved, turned = _difference(before, data.qpos.reshape(-1, 7))
+        if moved >= enough[0] or turned >= enough[1]:
+            break
+    return moved, turned
+
+
+def _difference(before: np.ndarray, after: np.ndarray) -> tuple[float, float]:
+    """Return the largest distance (m) and angle (rad) between positions and quaternions."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_quat(before[:, 3:], scalar_first=True).inv() * Rotation.from_quat(
         after[:, 3:], scalar_first=True
     )
