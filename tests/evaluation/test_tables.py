@@ -3,16 +3,18 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from vprism_plan.cli import main
-from vprism_plan.errors import ConfigError
+from vprism_plan.errors import ConfigError, MapError
 from vprism_plan.evaluation import generation, reconstruction, scene_truth
 from vprism_plan.evaluation.baselines import METHODS
 from vprism_plan.evaluation.camera import Camera
 from vprism_plan.evaluation.experiments import intervals, pictures, scoring, tables
+from vprism_plan.evaluation.experiments.sweep import SweepInputError
 from vprism_plan.evaluation.protocols import Method
 from vprism_plan.evaluation.scenes import Scene
 from vprism_plan.evaluation.solids import Box
@@ -160,6 +162,32 @@ def test_answers_about_changed_scenes_are_not_mixed(stubs, unpainted, tmp_path, 
     scoring._prepared.cache_clear()
     with pytest.raises(ConfigError, match="different scenes analytic 5"):
         run(tmp_path, methods=("voxel", "vprism"))
+
+
+def test_a_scene_that_fails_is_left_out_for_all_and_said(stubs, unpainted, tmp_path, monkeypatch):
+    whole, _ = run(tmp_path / "whole", scenes=4)
+    good = METHODS["vprism-paper"]
+
+    def fit(seen, seed):
+        if seed == 6:
+            raise MapError("too many hinge points")
+        return good.fit(seen, seed)
+
+    monkeypatch.setitem(METHODS, "vprism-paper", replace(good, fit=fit))
+    with pytest.raises(SweepInputError, match="analytic-6-vprism-paper: MapError: too many"):
+        run(tmp_path, scenes=4)
+    figures = json.loads((tmp_path / "out" / "baselines.json").read_text())
+    assert figures["sets"]["analytic"]["scenes"] == 3
+    for key in STUBS:
+        rows = figures["sets"]["analytic"]["methods"][key]["scenes"]
+        assert [row["seed"] for row in rows] == [5, 7, 8]
+        others = [s.mean_iou for n, s in enumerate(whole.sets[0].scores[key].scenes) if n != 1]
+        assert [row["iou"] for row in rows] == pytest.approx(others)
+    text = (tmp_path / "out" / "baselines.md").read_text()
+    assert "- analytic-6-vprism-paper: MapError: too many hinge points" in text
+    with pytest.raises(SweepInputError):  # nothing left to report on
+        run(tmp_path / "other", scenes=1, first_seed=6)
+    assert not (tmp_path / "other" / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -39,8 +39,7 @@ def write_report(results: TableResults, output: Path) -> list[Path]:
 
 def markdown(results: TableResults, figures: dict[str, Any]) -> str:
     """Return the report in Markdown; `figures` is `summary(results)`."""
-    table = results.table
-    seeds = results.sets[0].seeds
+    table, seeds = results.table, results.seeds
     lines = [
         f"# {table.title}", "", table.about, "",
         f"{len(seeds)} generated scenes of each set, seeds {seeds[0]} to {seeds[-1]}; 3 to 10 "
@@ -49,6 +48,9 @@ def markdown(results: TableResults, figures: dict[str, Any]) -> str:
         f"    {results.command}", "",
         f"Computed at commit {', '.join(figures['commits'])} (\"+\": with changes since).", "",
     ]  # fmt: skip
+    if results.left_out:
+        lines += ["Left out for every method, since these failed:", ""]
+        lines += [*(f"- {line}" for line in results.left_out), ""]
     lines += _claims(results)
     lines += [f"![IoU and Chamfer of every method]({table.key}.png)", ""]
     for found in results.sets:

@@ -19,7 +19,8 @@ from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments import scoring
 from vprism_plan.evaluation.experiments.claims import REPORTED, Verdict, claims_of, decide, gain
 from vprism_plan.evaluation.experiments.intervals import SceneScores, estimate
-from vprism_plan.evaluation.experiments.sweep import sweep
+from vprism_plan.evaluation.experiments.store import Case
+from vprism_plan.evaluation.experiments.sweep import SweepError, sweep
 from vprism_plan.evaluation.reconstruction import ReconstructionScores
 
 
@@ -97,13 +98,25 @@ class SetResults:
 
 @dataclass(frozen=True, eq=False)
 class TableResults:
-    """A table on all its sets. `verdicts[claim text][kind]` says which claims hold where."""
+    """A table on all its sets.
+
+    Attributes:
+        table: what was compared.
+        methods: rows, in order.
+        seeds: that were asked for, of every set.
+        sets: what was found.
+        command: that reprints it.
+        verdicts: by the text of a claim and the kind of a set.
+        left_out: what failed, in a line each; these scenes count for no method.
+    """
 
     table: Table
     methods: tuple[str, ...]
+    seeds: range
     sets: tuple[SetResults, ...]
     command: str
     verdicts: dict[str, dict[str, Verdict]]
+    left_out: tuple[str, ...] = ()
 
 
 def run(
@@ -137,7 +150,8 @@ def run(
 
     Raises:
         ConfigError: unknown table, set or method, no scene, or missing data.
-        SweepError: some scenes failed; all others are kept.
+        SweepError: some scenes failed. The report is written without them (and names them)
+            before this is raised, unless no scene of a set is left.
     """
     from vprism_plan.evaluation.experiments.report import write_report
 
@@ -154,16 +168,36 @@ def run(
         for kind in kinds
         for case in scoring.cases(kind, [seed], chosen, data)
     ]
-    answers = sweep(
-        scoring.score, cases, store, jobs=jobs, backend=backend, progress=progress,
-        group=scoring.scene_of, cluster=cluster,
+    failed: SweepError | None = None
+    options: dict[str, Any] = {
+        "jobs": jobs, "backend": backend, "progress": progress, "group": scoring.scene_of,
+        "cluster": cluster,
+    }  # fmt: skip
+    try:
+        answers = sweep(scoring.score, cases, store, **options)
+    except SweepError as error:
+        failed = error
+        cases = _without(cases, failed, kinds)
+        answers = sweep(scoring.score, cases, store, **options)
+    sets = tuple(_collected(kind, cases, answers) for kind in kinds)
+    results = TableResults(
+        table, chosen, seeds, sets, command, _verdicts(key, chosen, sets),
+        () if failed is None else tuple(f"{f.name}: {f.error}" for f in failed.failures),
     )  # fmt: skip
-    by_set = {kind: {key: [] for key in chosen} for kind in kinds}  # type: dict[str, dict[str, list[dict[str, Any]]]]
-    for case, answer in zip(cases, answers, strict=True):
-        by_set[case.asked["scene"]["set"]][case.asked["method"]["key"]].append(answer)
-    sets = tuple(_collected(kind, tuple(seeds), found) for kind, found in by_set.items())
-    results = TableResults(table, chosen, sets, command, _verdicts(key, chosen, sets))
-    return results, write_report(results, output)
+    files = write_report(results, output)
+    if failed is not None:
+        raise failed
+    return results, files
+
+
+def _without(cases: Sequence[Case], failed: SweepError, kinds: Sequence[str]) -> list[Case]:
+    """Return the cases of scenes on which every method has an answer; raise if a set has none."""
+    names = {failure.name for failure in failed.failures}
+    scenes = {scoring.scene_of(case) for case in cases if case.name in names}
+    kept = [case for case in cases if scoring.scene_of(case) not in scenes]
+    if {scoring.scene_of(case)[0] for case in kept} != set(kinds):
+        raise failed
+    return kept
 
 
 def chosen_table(key: str) -> Table:
@@ -183,41 +217,46 @@ def _check_sets(kinds: Sequence[str], data: Path | None) -> None:
         source(kind, data)
 
 
-def _collected(
-    kind: str, seeds: tuple[int, ...], found: dict[str, list[dict[str, Any]]]
-) -> SetResults:
+def _collected(kind: str, cases: Sequence[Case], answers: Sequence[dict[str, Any]]) -> SetResults:
     """Put the answers of one set together.
 
     Raises:
         ConfigError: methods were stored that saw different scenes of one seed.
     """
-    first = next(iter(found.values()))
-    for key, answers in found.items():
-        for seed, one, other in zip(seeds, first, answers, strict=True):
-            if one["seen"] != other["seen"]:
+    found: dict[str, dict[int, dict[str, Any]]] = {}
+    for case, answer in zip(cases, answers, strict=True):
+        own, seed = scoring.scene_of(case)
+        if own == kind:
+            found.setdefault(case.asked["method"]["key"], {})[seed] = answer
+    base, first = next(iter(found.items()))
+    for key, by_seed in found.items():
+        for seed, answer in by_seed.items():
+            if answer["seen"] != first[seed]["seen"]:
                 raise ConfigError(
-                    f"stored answers of {key} and {next(iter(found))} are about different scenes "
-                    f"{kind} {seed}: the generator has changed between them; remove the store, or "
-                    "raise experiments.scoring.SCENES"
+                    f"stored answers of {key} and {base} are about different scenes {kind} {seed}: "
+                    "the generator has changed between them; remove the store, or raise "
+                    "experiments.scoring.SCENES"
                 )
     return SetResults(
         kind,
-        seeds,
-        tuple(int(answer["objects"]) for answer in first),
+        tuple(first),
+        tuple(int(answer["objects"]) for answer in first.values()),
         {
-            key: SceneScores([ReconstructionScores.from_dict(a["scores"]) for a in answers])
-            for key, answers in found.items()
+            key: SceneScores([ReconstructionScores.from_dict(a["scores"]) for a in own.values()])
+            for key, own in found.items()
         },
-        {
-            key: (
-                float(np.median([a["seconds"]["fit"] for a in answers])),
-                1e6 * sum(a["seconds"]["predict"] for a in answers)
-                / max(1, sum(a["predicted_points"] for a in answers)),
-            )
-            for key, answers in found.items()
-        },
-        frozenset(str(a["commit"]) for answers in found.values() for a in answers),
-    )  # fmt: skip
+        {key: _cost(list(own.values())) for key, own in found.items()},
+        frozenset(str(a["commit"]) for own in found.values() for a in own.values()),
+    )
+
+
+def _cost(answers: Sequence[dict[str, Any]]) -> tuple[float, float]:
+    """Median seconds of a fit, and mean microseconds of predicting a point."""
+    points = max(1, sum(a["predicted_points"] for a in answers))
+    return (
+        float(np.median([a["seconds"]["fit"] for a in answers])),
+        1e6 * sum(a["seconds"]["predict"] for a in answers) / points,
+    )
 
 
 def _verdicts(
@@ -234,6 +273,8 @@ def summary(results: TableResults) -> dict[str, Any]:
     return {
         "table": results.table.key,
         "command": results.command,
+        "seeds": [results.seeds[0], results.seeds[-1]],
+        "left_out": list(results.left_out),
         "commits": sorted({c for found in results.sets for c in found.commits}),
         "sets": {found.kind: _set_summary(found, results) for found in results.sets},
         "claims": [
@@ -275,7 +316,6 @@ def _set_summary(found: SetResults, results: TableResults) -> dict[str, Any]:
         rows[key] = row
     some = next(iter(found.scores.values())).all
     return {
-        "seeds": [found.seeds[0], found.seeds[-1]],
         "scenes": len(found.seeds),
         "objects": sum(found.objects),
         "judged": len(some.objects),
