@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,6 +106,17 @@ def test_damage_is_named(scene, tmp_path):
     with pytest.raises(ObservationError, match=r"ground_truth\.json does not exist"):
         load_scene(tmp_path)
     scene.save(tmp_path)
+    truth = tmp_path / GROUND_TRUTH
+    whole = truth.read_text()
+    for damaged, message in (
+        (whole.replace('"seed"', '"sid"'), r"is not whole: KeyError\('seed'\)"),
+        (whole.replace("version 1", "version 9"), "version 9"),
+        ("{", "not readable JSON"),
+    ):
+        truth.write_text(damaged)
+        with pytest.raises(ObservationError, match=message):
+            load_scene(tmp_path)
+    truth.write_text(whole)
     model = tmp_path / "models" / "obj_000002.ply"
     model.write_bytes(b"ply\n")
     with pytest.raises(ObservationError, match=r"obj_000002\.ply is not a readable"):
@@ -112,10 +124,20 @@ def test_damage_is_named(scene, tmp_path):
     model.unlink()
     with pytest.raises(ObservationError, match=r"obj_000002\.ply is missing"):
         load_scene(tmp_path)
-    truth = tmp_path / GROUND_TRUTH
-    truth.write_text(truth.read_text().replace("version 1", "version 9"))
-    with pytest.raises(ObservationError, match="version 9"):
-        load_scene(tmp_path)
-    truth.write_text("{")
-    with pytest.raises(ObservationError, match="not readable JSON"):
-        load_scene(tmp_path)
+
+
+def test_a_replacement_that_fails_leaves_the_old_scene(scene, tmp_path, monkeypatch):
+    target = tmp_path / "scene"
+    scene.save(target)
+    rename = Path.rename
+
+    def refuse(self, other):
+        if self.name == "new":
+            raise OSError("disk full")
+        return rename(self, other)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(OSError, match="disk full"):
+        MeshScene(scene.objects[:1], scene.camera, scene.observation).save(target)
+    assert digest(load_scene(target)) == digest(scene)
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]

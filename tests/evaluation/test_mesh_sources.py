@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vprism_plan.errors import ConfigError, MissingDependencyError
-from vprism_plan.evaluation.generation import generate, source, sources
+from vprism_plan.evaluation.generation import generate, shapes, source, sources
 from vprism_plan.evaluation.generation.shapes import file_precision, read_shape, shape_of
 from vprism_plan.evaluation.generation.sources import YCB_VARIABLE
 
@@ -146,3 +146,11 @@ def test_random_objects_without_pybullet_name_the_extra(monkeypatch):
     assert find_spec("pybullet_data") is not None
     with pytest.raises(MissingDependencyError, match=r"vprism_plan\[evaluation\]"):
         source("random")
+
+
+def test_pieces_without_manifold3d_name_it(monkeypatch):
+    monkeypatch.setattr(shapes, "find_spec", lambda name: None)
+    left, right = trimesh.creation.box(), trimesh.creation.box()
+    right.apply_translation((0.5, 0.5, 0.5))
+    with pytest.raises(MissingDependencyError, match="pip install manifold3d"):
+        shape_of(left + right, "pair")

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vprism_plan.errors import MissingDependencyError
 from vprism_plan.evaluation._imaging import sense, table_depth
 from vprism_plan.evaluation.camera import Camera, DepthNoise
 from vprism_plan.perception.observation import Observation
@@ -63,8 +64,13 @@ def _cast(
 ) -> None:
     """Write what lies in front of the table into depth, index of the hit mesh and normals."""
     import trimesh
-    from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+    try:
+        from trimesh.ray.ray_pyembree import RayMeshIntersector
+    except ImportError as error:
+        raise MissingDependencyError(
+            "meshes are rendered with Embree: pip install embreex"
+        ) from error
     looked_at = np.zeros(depth.shape, dtype=bool)
     for mesh in meshes:
         middle = mesh.bounds.mean(axis=0)

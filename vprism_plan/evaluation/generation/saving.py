@@ -54,7 +54,12 @@ def save_scene(scene: MeshScene, path: str | Path) -> None:
         _write_truth(scene, new)
         if target.exists():
             target.rename(old)
-        new.rename(target)
+        try:
+            new.rename(target)
+        except OSError:
+            if old.exists():
+                old.rename(target)
+            raise
 
 
 def load_scene(path: str | Path) -> MeshScene:
@@ -66,6 +71,13 @@ def load_scene(path: str | Path) -> MeshScene:
     """
     folder = Path(path)
     data = _read_truth(folder)
+    try:
+        return _assembled(folder, data)
+    except (KeyError, TypeError) as error:
+        raise ObservationError(f"{folder / GROUND_TRUTH} is not whole: {error!r}") from error
+
+
+def _assembled(folder: Path, data: dict[str, Any]) -> MeshScene:
     objects = []
     for index, entry in enumerate(data["objects"]):
         vertices, faces = _read_model(_model(folder, index))
@@ -80,14 +92,9 @@ def load_scene(path: str | Path) -> MeshScene:
     )
     # A camera that the generator did not round differs from its file in the last bits.
     observation = replace(seen, T_world_camera=camera.T_world_camera, intrinsics=camera.intrinsics)
+    noise = None if data["noise"] is None else DepthNoise(**data["noise"])
     return MeshScene(
-        tuple(objects),
-        camera,
-        observation,
-        None if data["noise"] is None else DepthNoise(**data["noise"]),
-        data["seed"],
-        data["name"],
-        data["kind"],
+        tuple(objects), camera, observation, noise, data["seed"], data["name"], data["kind"]
     )
 
 

@@ -3,13 +3,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.errors import ConfigError
+from vprism_plan.errors import ConfigError, MissingDependencyError
 
 if TYPE_CHECKING:
     import trimesh
@@ -135,6 +136,10 @@ def _outer_surface(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
         mesh.remove_unreferenced_vertices()
         pieces = _closed_pieces(mesh)
     if len(pieces) > 1:
+        if find_spec("manifold3d") is None:
+            raise MissingDependencyError(
+                "meshes of several pieces are united with manifold3d: pip install manifold3d"
+            )
         for piece in pieces:
             middle = piece.bounds.mean(axis=0)
             piece.vertices = (piece.vertices - middle) * _SEAM + middle
