@@ -28,8 +28,8 @@ METHODS = ("sigmoid", "vprism")
 SEEDS = range(1000, 1004)
 KIND = "analytic"
 LEVEL = 0.5
-_CELL = 0.005  # metres between the points that are counted
-_ROOM = 0.1  # metres around the true objects in which they are
+_CELL = 0.01  # metres between the points that are counted
+_ROOM = 0.05  # metres around the true objects in which they are
 _FINE = 0.001  # metres per pixel of the picture
 _MARGIN = 0.03  # metres around the intersection that the picture shows at least
 
@@ -63,7 +63,7 @@ def run(output: Path, seeds: Sequence[int] = SEEDS, kind: str = KIND) -> list[Pa
             row[key] = {"twice": twice, "claimed": any_}
             claims = (proba[:, 1:] >= LEVEL).sum(axis=1)
             if key == "sigmoid" and (worst is None or twice > worst[0]):
-                worst = (twice, scene, fits, points[claims > 1])
+                worst = (twice, scene, fits, row, points[claims > 1])
         rows.append(row)
     assert worst is not None
     files = [output / f"intersections.{kind_}" for kind_ in ("png", "json", "md")]
@@ -74,9 +74,15 @@ def run(output: Path, seeds: Sequence[int] = SEEDS, kind: str = KIND) -> list[Pa
 
 
 def picture(
-    scene: TrueScene, fits: dict[str, Reconstruction], twice: Float[np.ndarray, "n 3"]
+    scene: TrueScene,
+    fits: dict[str, Reconstruction],
+    row: dict[str, Any],
+    twice: Float[np.ndarray, "n 3"],
 ) -> Figure:
-    """Draw both methods on the horizontal slice with most doubly claimed points."""
+    """Draw both methods on the horizontal slice with most doubly claimed points.
+
+    `row` holds the counts of `run`; `twice` (m) the points that sigmoid maps claim twice.
+    """
     heights, counts = np.unique(twice[:, 2], return_counts=True)
     height = float(heights[counts.argmax()]) if len(heights) else 0.03
     here = twice[twice[:, 2] == height][:, :2] if len(twice) else np.zeros((1, 2))
@@ -93,9 +99,8 @@ def picture(
         found = fits[key]
         proba = found.predict_proba(grid)[:, 1:].reshape(*a.shape, -1)
         _claims(axes, x, y, proba, found.object_ids, truth)
-        shared = overlap(found.predict_proba(claimed_points(scene)), LEVEL)[0]
-        litres = 1e6 * shared * _CELL**3
-        axes.set_title(f"{method(key).label}: {litres:.1f} cm$^3$ of the scene claimed twice")
+        volume = 1e6 * row[key]["twice"] * _CELL**3
+        axes.set_title(f"{method(key).label}: {volume:.0f} cm$^3$ of the scene claimed twice")
         axes.set_xlabel("x (m)")
     figure.axes[0].set_ylabel("y (m)")
     figure.legend(
