@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Train the learned baseline that the package carries.
 
-    python benchmarks/train_pointsdf.py [--solids 180] [--meshes 120] [--steps 1600] [--output FILE]
+    python benchmarks/train_pointsdf.py [--solids 180] [--meshes 120] [--steps 1200] [--output FILE]
 
 Arrangements of solids and of dropped meshes (objects 000 to 359 of those that pybullet brings;
 360 to 399 are held out for validation), several views of each, go to build/pointsdf/ in parts

@@ -39,7 +39,7 @@ class Schedule:
         seed: of the weights, the order of the examples and their variation.
     """
 
-    steps: int = 1600
+    steps: int = 1200
     batch: int = 32
     queries: int = 160
     rate: float = 2e-3
