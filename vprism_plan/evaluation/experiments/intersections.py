@@ -100,7 +100,9 @@ def picture(
         proba = found.predict_proba(grid)[:, 1:].reshape(*a.shape, -1)
         _claims(axes, x, y, proba, found.object_ids, truth)
         volume = 1e6 * row[key]["twice"] * _CELL**3
-        axes.set_title(f"{method(key).label}: {volume:.0f} cm$^3$ of the scene claimed twice")
+        axes.set_title(
+            f"{method(key).label}\n{volume:.0f} cm$^3$ of the scene claimed twice", fontsize=10
+        )
         axes.set_xlabel("x (m)")
     figure.axes[0].set_ylabel("y (m)")
     figure.legend(
