@@ -50,7 +50,8 @@ TABLES = {
             "baselines",
             "Reconstruction: V-PRISM and the systems it is compared with",
             "Table I of the paper, with more systems: every method sees the same single depth "
-            "image and the same object labels.",
+            "image and the same object labels. The point estimate and the sigmoid maps learn from "
+            "the points and features of our default preset, so that only the method differs.",
             ("voxel", "octomap", "sgd", "sigmoid", "pointsdf", "vprism-paper", "vprism"),
             "vprism",
         ),
