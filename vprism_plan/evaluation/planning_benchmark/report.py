@@ -167,17 +167,18 @@ def _sentence(s: Statement) -> str:
     interval = ""
     if s.quotient.low == s.quotient.low:
         interval = f", 95 % interval {s.quotient.low:.2f} to {s.quotient.high:.2f}"
+    theirs, ours = f"{100 * s.theirs:.1f} %", f"{100 * s.ours:.1f} %"
     if s.asked.startswith("collisions"):
-        place = "" if s.reached else " (ours end a little below it: their highest success counts)"
-        quotient = f"{s.quotient.value:.2f} times" if s.theirs else "both without"
+        place = "" if s.reached else f" (which {s.who} do not reach: their highest success counts)"
+        words = f"{s.quotient.value:.2f} times its true collisions{interval}"
         return (
-            f"At the success rate of {s.against}{place}, ours collide in {100 * s.ours:.1f} % of "
-            f"all problems, {s.against} in {100 * s.theirs:.1f} %: {quotient} its true "
-            f"collisions{interval}."
+            f"At the success rate of {s.against}{place}, {s.who} collide in {ours} of all "
+            f"problems, {s.against} in {theirs}: {words if s.theirs else 'it never collides'}."
         )
+    words = f"{s.quotient.value:.2f} times its successes{interval}"
     return (
-        f"At the collision rate of {s.against}, ours solve {100 * s.ours:.1f} % of the problems, "
-        f"{s.against} {100 * s.theirs:.1f} %: {s.quotient.value:.2f} times its successes{interval}."
+        f"At the collision rate of {s.against}, {s.who} solve {ours} of the problems, "
+        f"{s.against} {theirs}: {words if s.theirs else 'it solves none'}."
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.errors import ConfigError
-from vprism_plan.evaluation.experiments.intervals import Estimate, Statistic, estimate, ratio
+from vprism_plan.evaluation.experiments.intervals import Estimate, Statistic, ratio
 from vprism_plan.evaluation.planning_benchmark.checkers import CONTENDERS, Contender
 from vprism_plan.evaluation.planning_benchmark.run import Answer
 
@@ -19,6 +19,23 @@ __all__ = ["OURS", "Outcome", "Statement", "outcomes", "statements"]
 DEEP = 0.005  # metres of penetration that are more than a graze
 OURS = "ours"  # what our contenders' keys begin with
 REFERENCE = "truth"
+_RESAMPLES = 1999
+
+
+def estimate(statistic: Statistic, scenes: int) -> Estimate:
+    """Return a statistic of all scenes with its 95 percent bootstrap interval over them.
+
+    Draws that leave it undefined, such as a rate of paths where nobody found one, are left
+    out: few scenes hold many problems here, and such draws are no failure.
+    """
+    value = float(statistic(np.arange(scenes)))
+    drawn = np.random.default_rng(0xB007).integers(scenes, size=(_RESAMPLES, scenes))
+    values = np.asarray(statistic(drawn), dtype=np.float64)
+    values = values[np.isfinite(values)]
+    if scenes < 2 or len(values) == 0 or not np.isfinite(value):
+        return Estimate(value, float("nan"), float("nan"))
+    low, high = np.percentile(values, (2.5, 97.5))
+    return Estimate(value, float(low), float(high))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +174,7 @@ class Statement:
     """A comparison of our curve with one contender.
 
     Attributes:
+        who: "ours", or "ours with one rule" where none that tries several margins counts.
         against: label of the contender.
         asked: "collisions at its success rate" or "successes at its collision rate".
         theirs: the contender's figure, a share.
@@ -165,6 +183,7 @@ class Statement:
         reached: whether our curve reaches that place; otherwise its end is compared.
     """
 
+    who: str
     against: str
     asked: str
     theirs: float
@@ -236,17 +255,23 @@ def successes_at(
 def statements(found: Sequence[Outcome]) -> list[Statement]:
     """Compare our curve with meshes at their success, with unknown occupied at its collisions."""
     ours = [outcome for outcome in found if outcome.contender.key.startswith(OURS)]
+    groups = {
+        "ours": ours,
+        "ours with one rule": [o for o in ours if len(o.contender.bounds) == 1],
+    }
     by_key = {outcome.contender.key: outcome for outcome in found}
     made = []
-    if ours and "fcl" in by_key:
-        made.append(_compare(ours, by_key["fcl"], "collisions at its success rate"))
-    for key in ("octomap-occupied",):
-        if ours and key in by_key:
-            made.append(_compare(ours, by_key[key], "successes at its collision rate"))
+    for key, asked in (
+        ("fcl", "collisions at its success rate"),
+        ("octomap-occupied", "successes at its collision rate"),
+    ):
+        for who, own in groups.items():
+            if own and key in by_key and (who == "ours" or len(own) < len(ours)):
+                made.append(_compare(who, own, by_key[key], asked))
     return made
 
 
-def _compare(ours: Sequence[Outcome], other: Outcome, asked: str) -> Statement:
+def _compare(who: str, ours: Sequence[Outcome], other: Outcome, asked: str) -> Statement:
     mine = [outcome.counts() for outcome in ours]
     theirs = other.counts()
     at_success = asked.startswith("collisions")
@@ -270,6 +295,7 @@ def _compare(ours: Sequence[Outcome], other: Outcome, asked: str) -> Statement:
     everything = np.arange(len(other.answers))
     a, b, reached = figures(everything)
     return Statement(
+        who,
         other.contender.line if at_success else other.contender.label,
         asked,
         a,
