@@ -25,7 +25,7 @@ from vprism_plan.viz.map_plot import occluded
 SHOWN = ("sgd", "vprism")
 _RESOLUTION = 0.003  # metres per pixel of a heat map
 _ROOM = 0.08  # metres around the seen objects
-_NEAR = 0.006  # metres from the slice within which observed points are marked
+_NEAR = 0.004  # metres from the slice within which observed points are marked
 _SCENES_SHOWN = 5
 _REAL_COLUMNS = ("entropy_observed", "entropy_occluded", "auc_occluded", "auc_everywhere")
 
@@ -140,7 +140,7 @@ def _photograph(axes: Axes, heat: Heat) -> None:
             own = seen.labels == k
             image[own] = 0.55 * image[own] + 0.45 * tint
         with np.errstate(invalid="ignore"):
-            cut = np.abs(seen.point_image()[..., 2] - heat.height) < 0.5 * _NEAR
+            cut = np.abs(seen.point_image()[..., 2] - heat.height) < _NEAR
         image[cut & (seen.labels > 0)] = (124, 252, 0)
         rows, columns = np.nonzero(seen.labels > 0)
         top, bottom = max(rows.min() - 40, 0), rows.max() + 40
@@ -213,7 +213,9 @@ def markdown(figures: dict[str, Any]) -> str:
         "![Entropy on generated scenes](uncertainty.png)", "",
         "Each column is a scene: the image (green where the slice cuts what was seen), then the "
         "point estimate and V-PRISM on one colour scale; the camera is below. Behind the blue "
-        "line the camera saw nothing.", "",
+        "line the camera saw nothing. The even surface outside is where V-PRISM's hinge points "
+        "end: a map has its prior there, whether the camera saw it or not, while a point estimate "
+        "calls it empty.", "",
     ]  # fmt: skip
     for kind, found in figures["sets"].items():
         lines += [f"## {kind}: {found['scenes']} scenes", "", *_table(found["methods"]), ""]
