@@ -21,6 +21,7 @@ from matplotlib.patches import Patch
 from vprism_plan._files import write_text
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.baselines.sigmoid import overlap
+from vprism_plan.evaluation.experiments.scoring import commit
 from vprism_plan.evaluation.protocols import Reconstruction, TrueScene
 from vprism_plan.viz._figures import PALETTE, new_figure, save_figure
 
@@ -66,10 +67,11 @@ def run(output: Path, seeds: Sequence[int] = SEEDS, kind: str = KIND) -> list[Pa
                 worst = (twice, scene, fits, row, points[claims > 1])
         rows.append(row)
     assert worst is not None
+    found = {"commit": commit(), "level": LEVEL, "cell": _CELL, "rows": rows}
     files = [output / f"intersections.{kind_}" for kind_ in ("png", "json", "md")]
     save_figure(picture(*worst[1:]), files[0])
-    write_text(files[1], json.dumps({"level": LEVEL, "cell": _CELL, "rows": rows}, indent=1) + "\n")
-    write_text(files[2], markdown(rows))
+    write_text(files[1], json.dumps(found, indent=1) + "\n")
+    write_text(files[2], markdown(found))
     return files
 
 
@@ -142,7 +144,7 @@ def _claims(
             )  # fmt: skip
 
 
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
+def markdown(found: dict[str, Any]) -> str:
     """Return the counts as a report."""
     lines = [
         "# Intersecting reconstructions", "",
@@ -151,11 +153,12 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
         f"{1000 * _CELL:g} mm apart, of those that any claims. Probabilities of one softmax sum to "
         "1, so two of them cannot both exceed one half. Reprint with", "",
         "    python -m vprism_plan.evaluation.experiments.intersections", "",
+        f"Computed at commit {found['commit']} (\"+\": with changes since).", "",
         "![Two objects in one place](intersections.png)", "",
         "| scene | " + " | ".join(f"{method(k).label}: twice, of claimed" for k in METHODS) + " |",
         "|---" * (1 + len(METHODS)) + "|",
     ]  # fmt: skip
-    for row in rows:
+    for row in found["rows"]:
         cells = [
             f"{row[k]['twice']}, of {row[k]['claimed']} "
             f"({100.0 * row[k]['twice'] / max(row[k]['claimed'], 1):.1f} %)"
