@@ -67,11 +67,11 @@ def run(output: Path, seeds: Sequence[int] = SEEDS, kind: str = KIND) -> list[Pa
                 worst = (twice, scene, fits, row, points[claims > 1])
         rows.append(row)
     assert worst is not None
-    found = {"commit": commit(), "level": LEVEL, "cell": _CELL, "rows": rows}
+    counts = {"commit": commit(), "level": LEVEL, "cell": _CELL, "rows": rows}
     files = [output / f"intersections.{kind_}" for kind_ in ("png", "json", "md")]
     save_figure(picture(*worst[1:]), files[0])
-    write_text(files[1], json.dumps(found, indent=1) + "\n")
-    write_text(files[2], markdown(found))
+    write_text(files[1], json.dumps(counts, indent=1) + "\n")
+    write_text(files[2], markdown(counts))
     return files
 
 
