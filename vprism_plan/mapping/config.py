@@ -34,6 +34,7 @@ _RULES: dict[str, tuple[str, Callable]] = {
     "hinge_radius": _POSITIVE,
     "hinge_margin": _NON_NEGATIVE,
     "hinge_depth": _NON_NEGATIVE,
+    "hinge_reach": _NON_NEGATIVE,
     "box_trim": ("at least 0 and below 0.25", lambda v: _finite(v) and 0 <= v < 0.25),
     "stray_share": ("at least 0 and below 1", lambda v: _finite(v) and 0 <= v < 1),
     "surface_hinges": _whole(0),
@@ -62,7 +63,7 @@ _RULES: dict[str, tuple[str, Callable]] = {
 }
 _OPTIONAL = frozenset(
     {"hinge_depth", "prior_logit_variance", "prior_weight_variance", "prior_occupancy"}
-    | {"front_distance", "object_resolution", "empty_resolution"}
+    | {"front_distance", "hinge_reach", "object_resolution", "empty_resolution"}
 )
 
 
@@ -94,6 +95,11 @@ class MapConfig:
         stray_share: object points with fewer neighbours than this share of the object's
             median are flying pixels and not learned from (the paper: 0, keep all).
         hinge_depth: nodes deeper than this under the plane are dropped, m; None keeps all.
+        hinge_reach: nodes in space that was seen to be empty are dropped when farther than
+            this from every observed object point and not beside hidden space, m; at least
+            two kernel lengths, or surfaces move. None keeps all (the paper). A quarter of
+            the lattice tells only what the depth image tells, and the fit's cost grows
+            with the cube of its nodes.
         surface_hinges: random surface points taken as hinges, per object. Where the
             lattice is coarse they add detail; where it is fine they add prior variance
             in random places, and lose accuracy.
@@ -142,6 +148,7 @@ class MapConfig:
     hinge_radius: float = 0.12
     hinge_margin: float = 0.08
     hinge_depth: float | None = 0.05
+    hinge_reach: float | None = None
     box_trim: float = 0.01
     stray_share: float = 0.03
     surface_hinges: int = 0
@@ -200,6 +207,7 @@ class MapConfig:
             hinge_radius=0.15,
             hinge_margin=0.0,
             hinge_depth=None,
+            hinge_reach=None,
             box_trim=0.0,
             stray_share=0.0,
             surface_hinges=32,

@@ -13,6 +13,7 @@ from vprism_plan.mapping import negative_sampling as negatives
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior, Prior, fit_weights
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
+from vprism_plan.mapping.free_space import needed_nodes
 from vprism_plan.mapping.hinge_points import lattice_hinges, surface_hinges
 from vprism_plan.mapping.posterior import VPrismMap
 from vprism_plan.mapping.priors import expand_prior, weight_prior
@@ -103,7 +104,7 @@ def learning_problem(
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
     space = FeatureSpace(
-        sorted_hinges(new_hinges(data, object_ids, plane, config, rng)),
+        sorted_hinges(new_hinges(data, object_ids, views, plane, config, rng)),
         config.gamma,
         config.cutoff_radius,
     )
@@ -120,7 +121,7 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     config, plane = old.config, old.plane
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
-    candidates = new_hinges(data, seen, plane, config, rng)
+    candidates = new_hinges(data, seen, views, plane, config, rng)
     # New ground is where the old lattice did not reach: nodes it already has stay its own.
     added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
     hinges = np.concatenate([old.space.hinges, added])
@@ -219,12 +220,19 @@ def _without_strays(
 def new_hinges(
     data: TrainingData,
     object_ids: tuple[int, ...],
+    views: Sequence[Observation],
     plane: Plane,
     config: MapConfig,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "h 3"]:
     """Return lattice and surface hinge points of the training data (m, world)."""
     lattice = lattice_hinges(data.lower, data.upper, plane.normal, plane.offset, config)
+    if config.hinge_reach is not None:
+        lattice = lattice[
+            needed_nodes(
+                lattice, views, plane, data.surface, config.hinge_spacing, config.hinge_reach
+            )
+        ]
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
     hinges = np.concatenate([lattice, surface])
     _check_hinge_count(len(hinges), config)
