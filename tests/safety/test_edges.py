@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 import vprism_plan as vp
 
 FINE = 0.0025
-STEP = 0.0005
+STEP = 0.001
 
 
 @pytest.fixture(scope="module")
@@ -59,11 +60,12 @@ def test_two_thousand_accepted_edges_touch_nothing(checker, level_set):
         steps = max(2, int(np.ceil(report.motion_bound / STEP)) + 1)
         path = qa + np.linspace(0.0, 1.0, steps)[:, None] * (qb - qa)
         # Farther off, the field itself proves the configuration free (tested on its own).
-        for q in path[checker.clearance_batch(path) <= 0.004]:
-            centers = checker.sphere_clearances(q)[0][moving]
-            gaps = level_set.query(centers)[0] - radii
-            assert gaps.min() > -report.tolerance - 1e-9
-            assert (centers[:, 2] - radii).min() > -report.tolerance - 1e-6
-            examined += 1
+        near = path[checker.clearance_batch(path) <= 0.004]
+        centers = robot.sphere_centers(torch.from_numpy(near)).numpy()[:, moving]
+        # No sphere reaches a point that is farther than the largest of them: inf is as good.
+        gaps = level_set.query(centers, distance_upper_bound=radii.max())[0] - radii
+        assert (gaps > -report.tolerance - 1e-9).all()
+        assert (centers[..., 2] - radii > -report.tolerance - 1e-6).all()
+        examined += len(near)
         assert checker.self_clearance_batch(path).min() > -report.tolerance - 1e-9
     assert examined > 0
