@@ -32,9 +32,10 @@ def random_world(rng, unobserved="free", n=None):
     for _ in range(int(rng.integers(0, 3))):
         normal = rng.normal(size=3)
         planes.append([*(normal / np.linalg.norm(normal)), rng.uniform(-1.2, -0.4)])
-    truth = BallWorld(
-        rng.uniform(-0.9, 0.9, (n, 3)), rng.uniform(0.02, 0.3, n), np.array(planes).reshape(-1, 4)
-    )
+    centers = rng.uniform(-0.9, 0.9, (n, 3))
+    # A field knows obstacles inside its grid only, so none may stick out of it.
+    radii = np.minimum(rng.uniform(0.02, 0.3, n), 0.97 - np.abs(centers).max(axis=1))
+    truth = BallWorld(centers, radii, np.array(planes).reshape(-1, 4))
     return truth, truth.baked(SPACING, unobserved=unobserved)
 
 
