@@ -16,7 +16,7 @@ from jaxtyping import Float
 from vprism_plan.evaluation import baselines
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments.store import Case
-from vprism_plan.evaluation.protocols import Reconstruction, TrueScene
+from vprism_plan.evaluation.protocols import Method, Reconstruction, TrueScene
 from vprism_plan.evaluation.reconstruction import evaluate_reconstruction
 from vprism_plan.evaluation.scene_truth import SceneTruth
 from vprism_plan.mapping import MapConfig
@@ -82,8 +82,12 @@ def score(case: Case) -> dict[str, Any]:
     scene has, `seconds` of processor time of the fit and of predicting, how many points
     were predicted, the commit that computed it, and a digest of what the camera saw.
     """
+    return scored(case, method(case.asked["method"]["key"]))
+
+
+def scored(case: Case, chosen: Method) -> dict[str, Any]:
+    """Return the answer of `score` for any method, on the scene that a case asks for."""
     scene, truth = _prepared(**case.asked["scene"])
-    chosen = method(case.asked["method"]["key"])
     began = time.process_time()
     found = _Timed(chosen.fit(scene.observation, scene.seed))
     fit_seconds = time.process_time() - began
