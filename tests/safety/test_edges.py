@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 import vprism_plan as vp
 
 FINE = 0.0025
-STEP = 0.001
+STEP = 0.0005
 
 
 @pytest.fixture(scope="module")

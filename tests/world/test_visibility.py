@@ -196,7 +196,7 @@ def test_background_is_what_stands_unlabelled_on_the_table(hidden_scene):
     off = off[np.abs(hidden_scene.signed_distance(off)) < 0.015]
     assert len(off) > 1000
     held = world.field.lower_bound(off) <= 0.0
-    assert held.mean() > 0.998  # the rest are pixels beside the outline
+    assert held.mean() > 0.999  # the rest are pixels beside the outline
     names = np.array(world.sources)[world.field.source_at(off[held])]
     assert (names == "background").all()
     # The table itself is not background: a hand's width above it there is room.
@@ -221,7 +221,7 @@ def test_flying_pixels_are_no_background_but_a_thin_rod_is(hidden_scene):
     image = noisy.point_image()
     rod = image[rod_rows, 60:62].reshape(-1, 3)
     rod = rod[rod[:, 2] > 0.02]
-    assert len(rod) > 60
+    assert len(rod) > 60  # its ends are among them, which lack half their surroundings
     assert {tuple(p) for p in rod} <= {tuple(p) for p in kept}
     known = {tuple(p) for p in kept}
     off = [tuple(image[rows[i], columns[i]]) for i in pick]

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.spatial import cKDTree
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
@@ -212,6 +213,16 @@ def classify_points(
     return _OF_POINT[status]
 
 
+def _beside(
+    points: Float[np.ndarray, "n 3"], dense: Bool[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Which points (m) are dense, or within half a block of one that is."""
+    if dense.all() or not dense.any():
+        return dense
+    gap, _ = cKDTree(points[dense]).query(points, distance_upper_bound=0.5 * BLOCK)
+    return np.asarray(np.isfinite(gap))
+
+
 def background_points(
     views: Sequence[Observation], plane: Plane | None, height: float
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
@@ -221,7 +232,9 @@ def background_points(
     shows along the normal, if that is more. Without a plane every unlabelled point is.
     Points of the robot are not background, nor are flying pixels: those that, with all
     other points off the plane, fill less than 3 percent of what a surface that faces the
-    camera would show in the 3 cm around them. A rod 1 mm thick fills that.
+    camera would show in the 3 cm around them. A rod 1 mm thick fills that. What lies
+    within 1.5 cm of a point that is none stays: tips and edges lack half their
+    surroundings.
     """
     kept, widths = [], []
     for view in views:
@@ -233,7 +246,8 @@ def background_points(
             off = plane.signed_distance(points) > threshold
             chosen &= off
             focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-            chosen[off] &= points_around(points[off]) >= _LONE * (BLOCK * focal / depth[off]) ** 2
+            dense = points_around(points[off]) >= _LONE * (BLOCK * focal / depth[off]) ** 2
+            chosen[off] &= _beside(points[off], dense)
         kept.append(points[chosen])
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
         widths.append(0.5 * depth[chosen] / focal)
