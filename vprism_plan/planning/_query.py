@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.errors import PlanningError
+from vprism_plan.planning._clock import clock_named
 from vprism_plan.planning._planners import planner_kind
 from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._runtime import checked_seed
@@ -25,9 +26,11 @@ def search_request(
     stop: str,
     convergence: tuple[float, int],
     step: float | None,
+    clock: str,
 ) -> SearchRequest:
     """Check the parameters of the search; raise PlanningError naming the first bad one."""
     planner_kind(planner)
+    clock_named(clock)
     if not (math.isfinite(time_limit) and time_limit > 0):
         raise PlanningError(f"time_limit is {time_limit!r} s; it must be finite and more than 0")
     if stop not in ("limit", "first", "converged"):
@@ -47,6 +50,7 @@ def search_request(
         stop=stop,
         step=None if step is None else float(step),
         convergence=(float(tolerance), int(patience)),
+        clock=clock,
     )
 
 

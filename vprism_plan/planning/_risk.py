@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from vprism_plan.planning._clock import Now
 from vprism_plan.planning._protocol import CheckerLike, RiskChecker
 from vprism_plan.planning.result import PlanResult
 
@@ -13,7 +14,12 @@ from vprism_plan.planning.result import PlanResult
 Attempt = Callable[[CheckerLike, float, int], PlanResult]
 
 
-def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> PlanResult:
+def within_risk(
+    checker: CheckerLike,
+    attempt: Attempt,
+    time_limit: float,
+    now: Now = time.perf_counter,
+) -> PlanResult:
     """Plan until the joint risk of the whole path is within the checker's `max_risk`.
 
     The estimate comes from worlds that the search has not seen, by its upper confidence
@@ -23,8 +29,9 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
     Args:
         checker: whose `max_risk` holds.
         attempt: plans with a checker.
-        time_limit: wall time in seconds after which no further attempt starts; the time
+        time_limit: time in seconds after which no further attempt starts; the time
             spent on estimates (the first draws the worlds) does not count.
+        now: reads the clock, seconds.
 
     Returns:
         The first path within the bound; otherwise the least risky one as "too_risky", or
@@ -32,12 +39,12 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
     """
     if not isinstance(checker, RiskChecker) or checker.max_risk is None:
         return attempt(checker, time_limit, 0)
-    began = time.perf_counter()
+    began = now()
     best: PlanResult | None = None
     level, tried, spent = 0, 0, 0.0
     current: Any = checker
     while current is not None:
-        left = time_limit - (time.perf_counter() - began - spent)
+        left = time_limit - (now() - began - spent)
         if level > 0 and left <= 0.0:
             break
         result, tried = attempt(current, left if level else time_limit, level), level
@@ -45,9 +52,9 @@ def within_risk(checker: CheckerLike, attempt: Attempt, time_limit: float) -> Pl
             if best is None:
                 return result
             break
-        asked = time.perf_counter()
+        asked = now()
         risk = checker.collision_probability(result.path, held_out=True)
-        spent += time.perf_counter() - asked
+        spent += now() - asked
         report = replace(result.report, risk=risk, risk_levels=level, risk_time=spent)
         if risk.upper <= checker.max_risk:
             return replace(result, report=report, message=f"{result.message}; {risk.text()}")

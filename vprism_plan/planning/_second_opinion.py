@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from vprism_plan.errors import PlanningError
+from vprism_plan.planning._clock import Now
 from vprism_plan.planning._protocol import CheckerLike, SecondOpinion
 from vprism_plan.planning.result import PlanResult
 
@@ -29,16 +30,21 @@ def refuse_unfit(judge: Any, checker: CheckerLike) -> None:
         )
 
 
-def reviewed(result: PlanResult, checker: CheckerLike, judge: SecondOpinion | None) -> PlanResult:
+def reviewed(
+    result: PlanResult,
+    checker: CheckerLike,
+    judge: SecondOpinion | None,
+    now: Now = time.perf_counter,
+) -> PlanResult:
     """Return the result with what the judge says of its path; unchanged without a path or judge."""
     if judge is None or result.path is None:
         return result
-    began = time.perf_counter()
+    began = now()
     opinion = judge.review(checker, result.path)
     report = replace(
         result.report,
         second_opinion=opinion,
-        second_opinion_time=time.perf_counter() - began,
+        second_opinion_time=now() - began,
     )
     if opinion.valid:
         return replace(result, report=report)

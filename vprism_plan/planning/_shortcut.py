@@ -13,6 +13,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.planning._clock import Now
+
 Check = Callable[[np.ndarray, np.ndarray], bool]
 
 _MOST_CUTS = 120
@@ -23,7 +25,11 @@ _WORTHWHILE = 1e-6
 
 
 def shorten(
-    path: Float[np.ndarray, "t dof"], check: Check, seed: int, deadline: float
+    path: Float[np.ndarray, "t dof"],
+    check: Check,
+    seed: int,
+    deadline: float,
+    now: Now = time.perf_counter,
 ) -> Float[np.ndarray, "n dof"]:
     """Shorten a path by dropping waypoints and by random cuts (Geraerts and Overmars 2007).
 
@@ -32,25 +38,29 @@ def shorten(
         check: whether a straight motion is valid.
         seed: of the random cuts; the result depends on the clock only if the deadline
             strikes.
-        deadline: value of `time.perf_counter` after which no cut is tried.
+        deadline: reading of the clock after which no cut is tried.
+        now: reads the clock, seconds.
 
     Returns:
         Waypoints with the same ends. Edges that were not in `path` passed `check`.
     """
     rng = np.random.default_rng(seed)
-    path = drop_waypoints(path, check, deadline)
+    path = drop_waypoints(path, check, deadline, now)
     futile = 0
     for _ in range(_MOST_CUTS):
-        if len(path) < 3 or futile >= _FUTILE_CUTS or time.perf_counter() > deadline:
+        if len(path) < 3 or futile >= _FUTILE_CUTS or now() > deadline:
             break
         cut = _cut(path, check, rng)
         futile = futile + 1 if cut is None else 0
         path = path if cut is None else cut
-    return drop_waypoints(path, check, deadline)
+    return drop_waypoints(path, check, deadline, now)
 
 
 def drop_waypoints(
-    path: Float[np.ndarray, "t dof"], check: Check, deadline: float
+    path: Float[np.ndarray, "t dof"],
+    check: Check,
+    deadline: float,
+    now: Now = time.perf_counter,
 ) -> Float[np.ndarray, "n dof"]:
     """Connect each kept waypoint to the furthest one it reaches in a straight line."""
     kept = [0]
@@ -59,7 +69,7 @@ def drop_waypoints(
         here = kept[-1]
         reached = here + 1
         for ahead in range(last, here + 1, -1):
-            if time.perf_counter() > deadline:
+            if now() > deadline:
                 break
             if check(path[here], path[ahead]):
                 reached = ahead

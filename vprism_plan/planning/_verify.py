@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.planning._clock import Now
 from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._shortcut import Check
 from vprism_plan.planning.ompl_adapter import check_straight, straight_pieces
@@ -77,14 +78,15 @@ def verified(
     path: Float[np.ndarray, "t dof"],
     clearance_step: float,
     report: PlanReport,
+    now: Now = time.perf_counter,
 ) -> PlanResult:
     """Check every edge of the final waypoints again, and measure the path."""
-    began = time.perf_counter()
+    began = now()
     verdicts: list[Any] = []
     failed = _first_bad_edge(checker, path, verdicts)
     report = replace(
         report,
-        verification_time=time.perf_counter() - began,
+        verification_time=now() - began,
         motion_checks=report.motion_checks + len(verdicts),
     )
     if failed is not None:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`plan`: one query, one honest answer."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan.errors import PlanningError
+from vprism_plan.planning._clock import Now, clock_named
 from vprism_plan.planning._protocol import CheckerLike, SecondOpinion
 from vprism_plan.planning._query import configuration, refuse, search_request, valid_goals
 from vprism_plan.planning._risk import with_allowed_contacts, within_risk
@@ -44,6 +44,7 @@ def plan(
     clearance_step: float = 0.05,
     pose_goal: PoseGoalConfig | None = None,
     second_opinion: SecondOpinion | None = None,
+    clock: str = "wall",
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
@@ -60,7 +61,7 @@ def plan(
         goal: goal configuration (dof,), or the pose (4, 4) of the end effector in the
             world frame (see `pose_goal`).
         planner: RRTConnect, RRTstar, InformedRRTstar, BITstar, KPIECE1 or AORRTC.
-        time_limit: wall time for the search in seconds, more than 0.
+        time_limit: time for the search in seconds, more than 0; on `clock`.
         seed: an integer from 0. The same seed gives the same path as long as the search
             ends by itself before the limit. OMPL's generator is global: this seeds it.
         stop: when the optimising planners (RRTstar, InformedRRTstar, BITstar, AORRTC)
@@ -80,6 +81,9 @@ def plan(
         pose_goal: how a pose is turned into configurations.
         second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
             the path is still handed out: the report and the message say so.
+        clock: what limits, and all times of the report, are measured by: "wall", or
+            "process", the processor time of this process, which makes measurements on a
+            busy machine comparable (a search that waits for nothing takes the same).
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -87,7 +91,7 @@ def plan(
     Raises:
         PlanningError: for a malformed query, naming the value and the valid ones.
     """
-    request = search_request(planner, time_limit, seed, stop, convergence, step)
+    request = search_request(planner, time_limit, seed, stop, convergence, step, clock)
     for name, value in (("interpolate", interpolate), ("clearance_step", clearance_step)):
         if value is not None and not value > 0.0:
             raise PlanningError(f"{name} is {value!r}; it must be more than 0")
@@ -95,7 +99,10 @@ def plan(
         raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
     refuse_unfit(second_opinion, checker)
     q_start = configuration(start, checker.robot, "start")
-    report = PlanReport(planner=planner, seed=request.seed, time_limit=request.time_limit)
+    now = clock_named(clock)
+    report = PlanReport(
+        planner=planner, seed=request.seed, time_limit=request.time_limit, clock=clock
+    )
 
     refusal = refuse(checker, q_start, "start", report)
     if refusal is not None:
@@ -104,19 +111,19 @@ def plan(
     if isinstance(goals, PlanResult):
         return goals
     report = replace(report, state_checks=1 + len(goals), motion_checks=len(goals))
-    finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step)
+    finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step, now)
 
     def attempt(judge: CheckerLike, limit: float, number: int) -> PlanResult:
         direct = _direct(judge, q_start, goals)
         if direct is not None:
             path = finish.resampled(judge, direct[1])
             found = replace(report, direct=True, goal_index=direct[0])
-            return verified(judge, path, clearance_step, found)
+            return verified(judge, path, clearance_step, found, now)
         other = replace(request, time_limit=limit, seed=_other_seed(request.seed, 64 * number))
         return _searched(judge, q_start, goals, other, finish, report)
 
-    result = within_risk(checker, attempt, request.time_limit)
-    return reviewed(with_allowed_contacts(result, checker), checker, second_opinion)
+    result = within_risk(checker, attempt, request.time_limit, now)
+    return reviewed(with_allowed_contacts(result, checker), checker, second_opinion, now)
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,7 @@ class _Finish:
     simplify_time: float
     interpolate: float | None
     clearance_step: float
+    now: Now
 
     def shortened(
         self, checker: CheckerLike, path: Float[np.ndarray, "t dof"], report: PlanReport
@@ -134,12 +142,12 @@ class _Finish:
         """Return the path with fewer detours, and the report with what that took."""
         if not self.simplify:
             return path, report
-        began = time.perf_counter()
+        began = self.now()
         check = MotionCheck(checker)
-        path = shorten(path, check, report.seed, began + self.simplify_time)
+        path = shorten(path, check, report.seed, began + self.simplify_time, self.now)
         return path, replace(
             report,
-            simplification_time=report.simplification_time + time.perf_counter() - began,
+            simplification_time=report.simplification_time + self.now() - began,
             motion_checks=report.motion_checks + check.count,
         )
 
@@ -187,9 +195,8 @@ def _searched(
         path[0] = start
         path, report = finish.shortened(checker, path, report)
         path = finish.resampled(checker, path)
-        result = verified(
-            checker, path, finish.clearance_step, replace(report, goal_index=found.goal_index)
-        )
+        found_report = replace(report, goal_index=found.goal_index)
+        result = verified(checker, path, finish.clearance_step, found_report, finish.now)
         if result.solved:
             return result
         refused, report = result, result.report

@@ -24,7 +24,7 @@ class PlanReport:
     Attributes:
         planner: name of the planner that was asked for.
         seed: the seed of the query.
-        time_limit: seconds of wall time the search was allowed.
+        time_limit: seconds the search was allowed.
         planning_time: seconds spent searching.
         simplification_time: seconds spent shortening the path.
         verification_time: seconds spent re-checking the final waypoints.
@@ -60,6 +60,7 @@ class PlanReport:
         risk_time: seconds spent on those estimates.
         allowed_contacts: contacts that the rules permit, at the last waypoint: what the
             robot ends touching (`Contact`s).
+        clock: what all these seconds were measured by: "wall" or "process" (processor time).
     """
 
     planner: str
@@ -86,6 +87,7 @@ class PlanReport:
     risk_levels: int = 0
     risk_time: float = 0.0
     allowed_contacts: tuple[Any, ...] = ()
+    clock: str = "wall"
 
 
 @dataclass(frozen=True)
