@@ -85,7 +85,7 @@ def test_the_point_cloud_refuses_its_points_and_little_else(bench):
     rng = np.random.default_rng(0)
     some = rng.uniform((-0.2, -0.2, 0.03), (0.2, 0.2, 0.2), (5000, 3))
     refused = some[refuses(bench, "points", some)]
-    others, _ = background_points([bench.observation], bench.vprism.plane, 0.015)
+    others, _ = background_points([bench.observation], bench.vprism.plane, 0.015, 0.03)
     everything = np.concatenate([seen, others])
     near = [np.abs(everything - p).max(axis=1).min() <= 0.0125 for p in refused]
     assert all(near)  # three sigma of the noise here, and a cell

@@ -211,5 +211,4 @@ def test_reasons_of_a_ball_near_clutter_are_confirmed(demo_map, demo_world, orac
         return at + rng.uniform(0.0, 0.03, (n, 1)) * towards + rng.normal(0.0, 0.003, (n, 3))
 
     kinds = examine(checker, oracle, refused(checker, sample, 200))
-    # What lacks a label here are flying pixels, of which only those beside outlines count.
-    assert kinds.get("background", 0) >= 3, kinds
+    assert kinds.get("background", 0) > 20, kinds

@@ -185,6 +185,7 @@ def test_grid_of_a_seen_scene_leaves_room_for_an_arm(scene_kernel_map):
         ({"min_support": -1.0}, "min_support"),
         ({"occlusion_tolerance": -0.1}, "occlusion_tolerance"),
         ({"background_height": float("nan")}, "background_height"),
+        ({"lone_share": 0.5}, "lone_share"),
     ],
 )
 def test_config_names_what_is_wrong(settings, named):

@@ -53,7 +53,9 @@ def mark_unseen(
         if occluded == "posterior":
             _trust_posterior(map_, config.min_support, status, grid, spacing)
         _mark_corners(marks[status], nodes)
-    points, half = visibility.background_points(map_.views, map_.plane, config.background_height)
+    points, half = visibility.background_points(
+        map_.views, map_.plane, config.background_height, config.lone_share
+    )
     kernels.mark_boxes(points, half, grid.origin, spacing, np.uint8(BACKGROUND), nodes)
     for k, points, half in forgotten_points(
         map_.views, map_.object_ids, map_.plane, config.background_height, objects, grid

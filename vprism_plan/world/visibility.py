@@ -26,8 +26,6 @@ _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
 _THIN = 0.003
-# Share of what a surface shows below which points are flying pixels.
-_LONE = 0.03
 # Cells around the robot that it takes with it. Inside a cavity of occluded cells a field
 # whose nodes are two cells apart falls short of the distance by 2.8 cells at most.
 _ROOM = 2.0
@@ -224,32 +222,33 @@ def _beside(
 
 
 def background_points(
-    views: Sequence[Observation], plane: Plane | None, height: float
+    views: Sequence[Observation], plane: Plane | None, height: float, lone_share: float = 0.0
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Unlabelled points off the support plane, and half the width of their pixels, metres.
 
     "Off" is `height` metres, or three standard deviations of the depth noise as it
     shows along the normal, if that is more. Without a plane every unlabelled point is.
-    Points of the robot are not background, nor are flying pixels: those that, with all
-    other points off the plane, fill less than 3 percent of what a surface that faces the
-    camera would show in the 3 cm around them. A rod 1 mm thick fills that. What lies
-    within 1.5 cm of a point that is none stays: tips and edges lack half their
-    surroundings.
+    Points of the robot are not background, nor, if `lone_share` is above 0, are points
+    that with all others off the plane fill less than that share of what a surface facing
+    the camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills
+    3 percent. What lies within 1.5 cm of a point that is none stays: tips and edges lack
+    half their surroundings.
     """
     kept, widths = [], []
     for view in views:
         points, labels = view.points()
         depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
+        focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
         chosen = (labels == 0) & ~view.sees_robot[view.depth > 0]
         if plane is not None:
             threshold = np.maximum(height, 3.0 * _height_sigma(view, points, depth, plane))
             off = plane.signed_distance(points) > threshold
             chosen &= off
-            focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-            dense = points_around(points[off]) >= _LONE * (BLOCK * focal / depth[off]) ** 2
-            chosen[off] &= _beside(points[off], dense)
+            if lone_share > 0.0:
+                whole = (BLOCK * focal / depth[off]) ** 2
+                dense = points_around(points[off]) >= lone_share * whole
+                chosen[off] &= _beside(points[off], dense)
         kept.append(points[chosen])
-        focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
         widths.append(0.5 * depth[chosen] / focal)
     if not kept:
         return np.empty((0, 3)), np.empty(0)

@@ -38,6 +38,7 @@ __all__ = ["CONTENDERS", "Bench", "Contender", "contenders"]
 
 _OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things
 _STRAYS = 0.03  # share of neighbours below which a point is a flying pixel, as in the map
+_LONE = 0.03  # the same of points without a label: `WorldConfig.lone_share` for every contender
 _CELLS = 2  # cells per grid step that observed points mark
 OCTOMAP_OCCUPIED = 1
 
@@ -205,7 +206,9 @@ class Bench:
             if contender.map in ("vprism", "sgd"):
                 map_ = self.vprism if contender.map == "vprism" else self.sgd
                 config = WorldConfig(
-                    occluded=contender.occluded, bounds=benchmark_bounds(self.observation)
+                    occluded=contender.occluded,
+                    bounds=benchmark_bounds(self.observation),
+                    lone_share=_LONE,
                 )
                 make: Callable[[], Any] = lambda: World(map_, config)  # noqa: E731
             elif contender.map == "points":
@@ -274,7 +277,7 @@ class Bench:
         for own in np.unique(labels[keep]):
             rows = np.flatnonzero(labels == own)
             keep[rows] = ~stray_points(points[rows], _STRAYS)
-        others, _ = background_points([view], support_plane(view), _OFF_TABLE)
+        others, _ = background_points([view], support_plane(view), _OFF_TABLE, _LONE)
         points = np.concatenate([points[keep], others])
         labels = np.concatenate([labels[keep], np.zeros(len(others), dtype=labels.dtype)])
         return points, labels, (points - view.camera_center) @ view.pose[:3, 2]

@@ -34,7 +34,7 @@ from vprism_plan.world.visibility import OCCLUDED, SEEN, classify_points
 
 __all__ = ["Answer", "Limits", "answer_case", "problem_case", "run", "scene_of"]
 
-_VERSION = 2  # of what an answer means; counts as part of every question
+_VERSION = 3  # of what an answer means; counts as part of every question
 SOLIDS = "solids"  # analytic solids without physics: needs no optional package
 
 
