@@ -49,7 +49,7 @@ def log_text(found: Sequence[Outcome], name: str, limits: Limits, setup: str, da
         date: when it was computed, ISO 8601.
     """
     runs = sum(len(scene) for scene in found[0].answers) if found else 0
-    total = sum(answer.seconds for outcome in found for answer in outcome.all)
+    total = sum(answer.processor for outcome in found for answer in outcome.all)
     lines = [
         "OMPL version 2.0.1",
         f"Experiment {name.replace(' ', '_')}",
@@ -90,7 +90,7 @@ def _values(answer: Answer, scene: int) -> tuple[Any, ...]:
         _STATUS.index(answer.status),
         int(answer.solved),
         int(truth is not None and not truth.collides),
-        f"{answer.seconds:.6f}",
+        f"{answer.processor:.6f}",
         f"{answer.searched:.6f}",
         "" if answer.length is None else f"{answer.length:.6f}",
         "" if answer.travel is None else f"{answer.travel:.6f}",

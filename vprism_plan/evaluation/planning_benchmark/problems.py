@@ -48,7 +48,7 @@ class Criteria:
         hidden: share of the problems with an end whose finger tip the camera cannot see.
         straight: the straight motion comes nearer than this to something, or collides.
         tilt: largest angle between the hand's axis and straight down, radians.
-        time_limit: seconds for the proof that a pair is solvable.
+        time_limit: seconds of processor time for the proof that a pair is solvable.
     """
 
     clearance: float = 0.01
@@ -169,7 +169,8 @@ def _solvable(
             continue
         number = len(problems)
         own = int(np.random.default_rng([seed, number]).integers(2**31))
-        if not plan(spacious, a.q, b.q, time_limit=criteria.time_limit, seed=own).solved:
+        found = plan(spacious, a.q, b.q, time_limit=criteria.time_limit, seed=own, clock="process")
+        if not found.solved:
             continue
         open_left -= seen
         problems.append(

@@ -269,7 +269,8 @@ def _explanation(about: dict[str, Any]) -> list[str]:
         "from the true scene (a third each), and the same planner has found a path that keeps "
         f"{1000 * c['clearance']:.0f} mm within {c['time_limit']:g} s on the truth. So a checker "
         "that refuses an end, or finds no path, is too careful or wrong there.",
-        f"- **Planner**: {limits['planner']}, {limits['time_limit']:g} s for the search, then "
+        f"- **Planner**: {limits['planner']}, {limits['time_limit']:g} s of processor time for the "
+        f"search, then "
         f"shortening (at most {limits['simplify_time']:g} s); the same seed for everybody.",
         "- **Truth**: exact distances of the spheres to the true meshes and the table at samples "
         "with at most 2 mm of motion between them. Any penetration is a collision.",

@@ -40,7 +40,8 @@ SOLIDS = "solids"  # analytic solids without physics: needs no optional package
 
 @dataclass(frozen=True)
 class Limits:
-    """What every contender is given. Seconds.
+    """What every contender is given. Seconds of processor time, so that a busy machine gives
+    as much as an idle one.
 
     Attributes:
         planner: of `vprism_plan.plan`.
@@ -64,7 +65,7 @@ class Answer:
             "risk", another link, ...), empty otherwise.
         seconds: wall time of the query.
         processor: processor time of it.
-        searched: of that, seconds of the planner's search.
+        searched: of that, the planner's search.
         truth: what the true scene says of the path, None without one.
         known: what was known of the place that the path hits: "seen", "supported" (occluded,
             the map can judge), "unsupported", "unobserved", "table"; empty without a hit.
@@ -174,6 +175,7 @@ def ask(
             time_limit=limits.time_limit / len(checkers),
             seed=problem.seed,
             simplify_time=limits.simplify_time,
+            clock="process",
         )
         if result.solved:
             break
