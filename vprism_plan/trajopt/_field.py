@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Values on a grid as a function with a continuous gradient."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int
+from torch import Tensor
+
+from vprism_plan.world.distance import NodeDistances, finish
+from vprism_plan.world.grid import Grid
+
+# Variance of the spline's weights about the point, in squared grid steps, three axes.
+SPREAD = 0.75
+
+
+class SplineField:
+    """Quadratic B-splines over the nodes of a grid: 27 nodes a point, continuous gradient.
+
+    The weights are positive, sum to 1, average to the point and have the variance h^2 / 4
+    per axis. So linear functions are reproduced, and where the nodes hold distances d_i to a
+    set, |x|^2 - d(x)^2 being convex, the value D obeys D(x)^2 <= d(x)^2 + 3 h^2 / 4: it
+    exceeds a distance by at most that (see `grown`). There is no flat cell on the ridge
+    between two equal nodes, as linear interpolation has.
+
+    Outside the grid, a metres from its nearest point c: min(D(c), 0) + hypot(a, max(D(c), 0)),
+    which continues distances outwards; or D(c) - a, if everything outside is an obstacle.
+
+    Args:
+        values: (rules, nx, ny, nz) one set of node values per contact rule.
+        origin: world position of node (0, 0, 0), metres.
+        spacing: h, metres.
+        solid_outside: see above.
+    """
+
+    def __init__(
+        self,
+        values: Float32[np.ndarray, "g nx ny nz"],
+        origin: Float[np.ndarray, " 3"],
+        spacing: float,
+        solid_outside: bool = False,
+    ) -> None:
+        self.values = np.ascontiguousarray(values)
+        self.origin = np.asarray(origin, dtype=np.float64)
+        self.spacing = float(spacing)
+        self.solid_outside = solid_outside
+        self._tensors: dict[Any, Tensor] = {}
+
+    def __call__(
+        self, points: Float[Tensor, "m s 3"], rules: Int[np.ndarray, " s"]
+    ) -> Float[Tensor, "m s"]:
+        """Value at points (metres), under the rule of each column; any order differentiable."""
+        device, dtype = points.device, points.dtype
+        values = self._on(device, dtype)
+        sizes = self.values.shape[1:]
+        size = torch.tensor(sizes, device=device)
+        origin = torch.as_tensor(self.origin, dtype=dtype, device=device)
+        scaled = (points - origin) / self.spacing
+        top = (size - 1).to(dtype)
+        inside = torch.minimum(scaled.clamp(min=0.0), top)
+        node = (inside.detach() + 0.5).floor().long()
+        node = torch.minimum(node, size - 1)
+        t = inside - node
+        weights = torch.stack(
+            [0.5 * (0.5 - t).square(), 0.75 - t.square(), 0.5 * (0.5 + t).square()], dim=-1
+        )
+        around = torch.minimum(
+            (node[..., None] + torch.arange(-1, 2, device=device)).clamp(min=0), size[:, None] - 1
+        )
+        first = torch.as_tensor(rules, device=device) * int(np.prod(sizes))
+        total = torch.zeros_like(points[..., 0])
+        for i in range(3):
+            for j in range(3):
+                rows = (around[..., 0, i] * sizes[1] + around[..., 1, j]) * sizes[2] + first
+                across = weights[..., 0, i] * weights[..., 1, j]
+                along = sum(weights[..., 2, k] * values[rows + around[..., 2, k]] for k in range(3))
+                total = total + across * along
+        away = self.spacing**2 * (scaled - inside).square().sum(dim=-1)
+        outside = away > 0.0
+        way = torch.where(outside, away, 1.0)
+        if self.solid_outside:
+            return torch.where(outside, total - way.sqrt(), total)
+        beyond = total.clamp(max=0.0) + (way + total.clamp(min=0.0).square()).sqrt()
+        return torch.where(outside, beyond, total)
+
+    def _on(self, device: torch.device, dtype: torch.dtype) -> Tensor:
+        if (device, dtype) not in self._tensors:
+            flat = torch.from_numpy(self.values.reshape(-1))
+            self._tensors[device, dtype] = flat.to(device=device, dtype=dtype)
+        return self._tensors[device, dtype]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_tensors": {}}
+
+
+def grown(radii: Float[np.ndarray, " s"], spacing: float) -> Float[np.ndarray, " s"]:
+    """Return what a spline of distances must exceed for a ball to be clear, metres.
+
+    With D^2 <= d^2 + 3 h^2 / 4, D > sqrt(r^2 + 3 h^2 / 4) proves d > r.
+    """
+    return np.sqrt(radii**2 + SPREAD * spacing**2)
+
+
+def union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> SplineField:
+    """Signed distance to fields' obstacles and half-spaces together, one per contact rule.
+
+    Where an object stands on a table, the way out of the object is not down into the
+    table: depth is the distance to what is outside of both. Without this, the pull of the
+    object's underside and the push of the table cancel.
+    """
+    field = fields[0]
+    spacing = float(field.spacing)
+    shape = field.distance.shape
+    first = np.rint(np.asarray(field.origin) / spacing).astype(np.int64)
+    grid = Grid(spacing, first, (shape[0], shape[1], shape[2]))
+    floor = _plane_distances(grid, planes)
+    solid = bool(getattr(field, "solid_outside", False))
+    merged = []
+    for own in fields:
+        nodes = np.maximum(np.minimum(own.distance, floor), 0.0).astype(np.float32)
+        source = np.zeros(shape, dtype=np.int16)
+        merged.append(finish(NodeDistances(nodes, source), grid, (), solid).distance)
+    return SplineField(np.stack(merged), np.asarray(field.origin), spacing, solid)
+
+
+def _plane_distances(
+    grid: Grid, planes: Float[np.ndarray, "p 4"]
+) -> Float32[np.ndarray, "nx ny nz"]:
+    nearest = np.full(grid.shape, np.inf, dtype=np.float32)
+    for start in range(0, grid.shape[0], 16):
+        stop = min(start + 16, grid.shape[0])
+        nodes = grid.slab(start, stop)
+        for row in planes:
+            away = (nodes @ row[:3] - row[3]).reshape(stop - start, *grid.shape[1:])
+            np.minimum(nearest[start:stop], away, out=nearest[start:stop], casting="same_kind")
+    return nearest

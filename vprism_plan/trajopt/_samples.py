@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Configurations between waypoints, so that costs see what lies between them."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan.trajopt.cost import at_least
+
+MAX_TURN = 0.5  # radians of any joint between two samples: keeps arcs from hiding behind chords
+MAX_PARTS = 64  # of an edge: a wild step of an optimiser must not fill the memory
+_SHORT = 1e-6  # metres: below it a way counts quadratically, so that standing still is smooth
+
+
+@dataclass(frozen=True)
+class Subdivision:
+    """How edges are divided: by how far spheres move, or a fixed number of times.
+
+    An edge gets the smallest number of parts for which no sphere centre's chord exceeds
+    `spacing` metres per part and no joint turns by more than half a radian per part, at
+    most 64; each edge for itself, so that a trajectory's cost does not depend on its
+    company. `parts` fixes the number for all edges instead.
+    """
+
+    spacing: float
+    parts: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no subdivision."""
+        at_least("spacing", self.spacing, 0.0, "metres", strictly=True)
+        if self.parts is not None and not 1 <= int(self.parts) <= MAX_PARTS:
+            raise ConfigError(
+                f"subsamples is {self.parts!r}; give 1 to {MAX_PARTS} parts per edge, or None"
+            )
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Configurations along a batch of trajectories, one trajectory after the other.
+
+    Attributes:
+        q: (M, dof), attached to the waypoints.
+        trajectory: (M,) which trajectory each belongs to.
+        weight: (M,) its share of the time (trapezoid rule); sums to 1 per trajectory.
+        count: number of trajectories.
+    """
+
+    q: Float[Tensor, "m dof"]
+    trajectory: Int[Tensor, " m"]
+    weight: Float[Tensor, " m"]
+    count: int
+
+    def total(self, values: Float[Tensor, " m"]) -> Float[Tensor, " b"]:
+        """Return the sum of the samples' values for each trajectory."""
+        zeros = values.new_zeros(self.count)
+        return zeros.index_add(0, self.trajectory, values)
+
+    def ways(self, centers: Float[Tensor, "m s 3"]) -> Float[Tensor, "m s"]:
+        """Return half the way from the sample before plus half the way to the next, metres."""
+        steps = centers[1:] - centers[:-1]
+        squares = steps.square().sum(dim=-1) + _SHORT**2
+        way = 0.5 * (squares.sqrt() - _SHORT)
+        joined = (self.trajectory[1:] == self.trajectory[:-1])[:, None]
+        way = torch.where(joined, way, torch.zeros_like(way))
+        none = way.new_zeros(1, centers.shape[1])
+        return torch.cat([way, none]) + torch.cat([none, way])
+
+
+def require_dof(robot: Any, q: Tensor) -> None:
+    """Raise RobotError unless the last axis of q has the robot's joints."""
+    if q.shape[-1] != robot.dof:
+        raise RobotError(
+            f"q has shape {tuple(q.shape)}; {robot.name} needs (..., T, {robot.dof}): "
+            f"{', '.join(robot.joint_names)}"
+        )
+
+
+def path_steps(
+    robot: Any, q: Float[Tensor, "*batch time dof"]
+) -> Float[Tensor, "*batch steps dof"]:
+    """Change of the joints along each edge; with a robot, continuous joints go the short way."""
+    delta = q.diff(dim=-2)
+    if robot is None:
+        return delta
+    require_dof(robot, q)
+    if not bool(robot.continuous.any()):
+        return delta
+    free = torch.as_tensor(robot.continuous, device=q.device)
+    turns = torch.where(free, (delta.detach() / (2.0 * math.pi)).round(), 0.0)
+    return delta - 2.0 * math.pi * turns
+
+
+def sample_paths(robot: Any, q: Float[Tensor, "b time dof"], subdivision: Subdivision) -> Samples:
+    """Divide the edges of trajectories as the subdivision says."""
+    count, time, dof = q.shape
+    delta = path_steps(robot, q)
+    parts = _parts(robot, q.detach(), delta.detach(), subdivision)
+    # The last waypoint is an edge that goes nowhere.
+    parts = torch.cat([parts, parts.new_ones(count, 1)], dim=1)
+    delta = torch.cat([delta, torch.zeros_like(q[:, :1])], dim=1)
+    span = torch.ones_like(parts, dtype=q.dtype) / (parts * max(1, time - 1))
+    span[:, -1] = 0.0
+    before = torch.cat([torch.zeros_like(span[:, :1]), span[:, :-1]], dim=1)
+    flat = parts.reshape(-1)
+    edge = torch.repeat_interleave(torch.arange(len(flat), device=q.device), flat)
+    number = torch.arange(len(edge), device=q.device) - (flat.cumsum(0) - flat)[edge]
+    fraction = number / flat[edge]
+    own, previous = span.reshape(-1)[edge], before.reshape(-1)[edge]
+    weight = 0.5 * (own + torch.where(number > 0, own, previous))
+    if time == 1:
+        weight = torch.ones_like(weight)
+    rows = q.reshape(-1, dof)[edge] + fraction[:, None].to(q.dtype) * delta.reshape(-1, dof)[edge]
+    return Samples(rows, edge // time, weight, count)
+
+
+def _parts(
+    robot: Any,
+    q: Float[Tensor, "b time dof"],
+    delta: Float[Tensor, "b steps dof"],
+    subdivision: Subdivision,
+) -> Int[Tensor, "b steps"]:
+    if subdivision.parts is not None:
+        return torch.full(delta.shape[:2], subdivision.parts, dtype=torch.int64, device=q.device)
+    if delta.shape[1] == 0:
+        return torch.zeros(delta.shape[:2], dtype=torch.int64, device=q.device)
+    arrays = robot.arrays
+    with torch.no_grad():
+        centers = robot.sphere_centers(q)
+    way = centers.diff(dim=1).square().sum(dim=-1).amax(dim=-1).sqrt()
+    turning = torch.zeros(q.shape[-1], dtype=torch.bool, device=q.device)
+    turning[torch.as_tensor(arrays.q_index[arrays.kind == 1], device=q.device)] = True
+    turn = torch.where(turning, delta.abs(), 0.0).amax(dim=-1)
+    wanted = torch.maximum(way / subdivision.spacing, turn / MAX_TURN)
+    return wanted.clamp(max=MAX_PARTS).ceil().clamp(min=1).long()

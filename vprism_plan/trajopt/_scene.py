@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which obstacles count for which sphere of a robot."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.collision import CollisionChecker
+from vprism_plan.errors import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A robot among obstacles, as one checker (or a checker without settings) sees them.
+
+    Attributes:
+        world: the world.
+        robot: the robot.
+        rules: sets of objects that may be touched, one per contact rule.
+        sphere_rules: (S,) the rule of each sphere; -1 where no joint moves its link, which
+            is not checked against the world.
+        margin: metres that the checker wants spheres to keep.
+        checker: the checker, if there is one.
+    """
+
+    world: Any
+    robot: Any
+    rules: tuple[frozenset[int], ...]
+    sphere_rules: Int[np.ndarray, " s"]
+    margin: float
+    checker: CollisionChecker | None
+
+    @property
+    def radii(self) -> Float[np.ndarray, " s"]:
+        """(S,) radii of the spheres with the checker's margin, metres."""
+        return self.robot.arrays.sphere_radius + self.margin
+
+    def fields(self) -> list[Any]:
+        """Return the distance field of each rule: the one verdicts are given by."""
+        if self.checker is None:
+            return [self.world.field]
+        arrays = self.robot.arrays
+        found: list[Any] = [None] * len(self.rules)
+        for link in range(len(arrays.link_frame)):
+            found[self.rules.index(self.checker.allowed_objects(link))] = (
+                self.checker.verdict_field(link)
+            )
+        return found
+
+
+def scene_of(world: Any, robot: Any) -> Scene:
+    """Put a scene together from a checker, or from a world and a robot.
+
+    Raises:
+        ConfigError: a robot is missing, or another one than the checker's is given.
+    """
+    if isinstance(world, CollisionChecker):
+        if robot is not None and robot is not world.robot:
+            raise ConfigError(
+                "a checker brings its own robot; leave `robot` out, or build a checker for this one"
+            )
+        robot = world.robot
+        per_link = [world.allowed_objects(k) for k in range(len(robot.arrays.link_frame))]
+        rules = tuple(dict.fromkeys(per_link))
+        index = np.array([rules.index(own) for own in per_link], dtype=np.int64)
+        margin, checker, world = float(world.config.margin), world, world.world
+    else:
+        if robot is None:
+            raise ConfigError("a world alone has no robot; pass one, or pass a CollisionChecker")
+        rules, margin, checker = (frozenset[int](),), 0.0, None
+        index = np.zeros(len(robot.arrays.link_frame), dtype=np.int64)
+    index = np.where(robot.arrays.link_fixed, -1, index)
+    return Scene(world, robot, rules, index[robot.arrays.sphere_link], margin, checker)

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Costs that look at joint values alone: smoothness and joint limits."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan.trajopt._samples import path_steps, require_dof
+from vprism_plan.trajopt.cost import TrajectoryCost, at_least
+
+
+class SmoothnessCost(TrajectoryCost):
+    """Squared velocity, acceleration and jerk, integrated along the trajectory.
+
+    With T waypoints at equal times over `duration`, step h = duration / (T - 1) and the
+    n-th differences D^n q of the waypoints, each term is
+
+        sum_t |D^n q_t|^2 / h^(2 n - 1),
+
+    the integral of the squared n-th derivative: it does not depend on how many waypoints
+    a trajectory has. rad^2 / s for velocity, rad^2 / s^3 and rad^2 / s^5 for the others;
+    metres instead of radians for sliding joints. A trajectory with too few waypoints for
+    a difference has none of it. O(T dof).
+
+    Args:
+        velocity, acceleration, jerk: factors of the terms, at least 0.
+        robot: with it, continuous joints go the short way round, as the checker's edges do.
+        duration: seconds from the first waypoint to the last.
+        joint_weights: (dof,) factors on the squared differences; None is 1.
+        weight, name: see `TrajectoryCost`.
+    """
+
+    def __init__(
+        self,
+        *,
+        velocity: float = 1.0,
+        acceleration: float = 0.0,
+        jerk: float = 0.0,
+        robot: Any = None,
+        duration: float = 1.0,
+        joint_weights: Sequence[float] | None = None,
+        weight: float = 1.0,
+        name: str = "smoothness",
+    ) -> None:
+        super().__init__(weight, name)
+        self.factors = (
+            at_least("velocity", velocity, 0.0),
+            at_least("acceleration", acceleration, 0.0),
+            at_least("jerk", jerk, 0.0),
+        )
+        self.duration = at_least("duration", duration, 0.0, "seconds", strictly=True)
+        self.robot = robot
+        self.joint_weights = None if joint_weights is None else tuple(map(float, joint_weights))
+        if self.joint_weights is not None and not all(
+            0.0 <= w < math.inf for w in self.joint_weights
+        ):
+            raise ConfigError(
+                f"joint_weights is {joint_weights!r}; they must be finite and at least 0"
+            )
+
+    def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
+        """Return the cost without its weight."""
+        difference = path_steps(self.robot, q)
+        factors: Tensor | None = None
+        if self.joint_weights is not None:
+            if len(self.joint_weights) != q.shape[-1]:
+                raise RobotError(
+                    f"q has {q.shape[-1]} joints, joint_weights has {len(self.joint_weights)}"
+                )
+            factors = q.new_tensor(self.joint_weights)
+        total = 0.0 * q.sum(dim=(-2, -1))
+        step = self.duration / max(1, q.shape[-2] - 1)
+        for order, factor in enumerate(self.factors, start=1):
+            if difference.shape[-2] == 0:
+                break
+            if factor > 0.0:
+                squares = difference.square()
+                if factors is not None:
+                    squares = squares * factors
+                total = total + factor / step ** (2 * order - 1) * squares.sum(dim=(-2, -1))
+            difference = difference.diff(dim=-2)
+        return total
+
+
+class JointLimitCost(TrajectoryCost):
+    """Squared distance of joints beyond their limits less a margin, averaged over waypoints.
+
+        mean_t sum_j max(0, lower_j + m - q_tj)^2 + max(0, q_tj - upper_j + m)^2,
+
+    rad^2 (m^2 for sliding joints). Continuous joints have no limits. Where a range is
+    narrower than two margins, m is half of it. O(T dof).
+
+    Args:
+        robot: whose limits.
+        margin: m, radians or metres.
+        weight, name: see `TrajectoryCost`.
+    """
+
+    def __init__(
+        self,
+        robot: Any,
+        *,
+        margin: float = 0.05,
+        weight: float = 1.0,
+        name: str = "joint limits",
+    ) -> None:
+        super().__init__(weight, name)
+        self.robot = robot
+        self.margin = at_least("margin", margin, 0.0, "radians or metres")
+
+    def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
+        """Return the cost without its weight."""
+        require_dof(self.robot, q)
+        limits = torch.tensor(
+            [
+                (-math.inf, math.inf)
+                if free
+                else (low + min(self.margin, 0.5 * (high - low)),
+                      high - min(self.margin, 0.5 * (high - low)))
+                for low, high, free in zip(
+                    self.robot.lower.tolist(),
+                    self.robot.upper.tolist(),
+                    self.robot.continuous.tolist(),
+                    strict=True,
+                )
+            ],
+            dtype=q.dtype,
+            device=q.device,
+        )  # fmt: skip
+        below = (limits[:, 0] - q).clamp(min=0.0)
+        above = (q - limits[:, 1]).clamp(min=0.0)
+        return (below.square() + above.square()).sum(dim=-1).mean(dim=-1)
