@@ -39,7 +39,7 @@ def test_what_the_readme_shows_of_risk_contacts_and_margins_runs_after_the_first
 
 def test_the_ompl_lines_are_those_of_the_example(repository):
     shown = blocks((repository / "README.md").read_text(), "python")[2]
-    program = (repository / "examples" / "own_ompl_program.py").read_text()
+    program = (repository / "examples" / "02_your_own_ompl_program.py").read_text()
     lines = [line.split("#")[0].strip() for line in shown.splitlines() if line.strip()]
     assert len(lines) <= 10
     for line in lines:

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What the examples say, beyond that they run and draw: building the site shows that."""
+
+import re
+import runpy
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def saved_demo_map(demo_map, tmp_path_factory):
+    """The bundled scene's map in a file, so that no example fits it again."""
+    path = tmp_path_factory.mktemp("example_maps") / "demo.safetensors"
+    demo_map.save(path)
+    return path
+
+
+@pytest.fixture
+def said_by(repository, saved_demo_map, tmp_path, monkeypatch, capsys):
+    """A function that runs an example as a program and returns what it printed."""
+
+    def run(number):
+        (script,) = (repository / "examples").glob(f"{number}_*.py")
+        picture = tmp_path / f"{number}.png"
+        arguments = [str(script), "--picture", str(picture), "--map", str(saved_demo_map)]
+        monkeypatch.setattr(sys, "argv", arguments)
+        runpy.run_path(str(script), run_name="__main__")
+        assert picture.stat().st_size > 10_000
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.mark.slow
+def test_a_bound_on_risk_gives_a_less_risky_path_than_none(said_by):
+    said = said_by("03")
+    straight, free, bounded = (float(p) for p in re.findall(r"P\(collision\) (\d\.\d+)", said))
+    assert straight > 0.5
+    assert bounded <= 0.05
+    assert bounded <= free
+    assert "max_risk 0.05: exact" in said
+
+
+@pytest.mark.slow
+def test_a_path_may_end_touching_the_target_and_says_so(said_by):
+    said = said_by("06")
+    assert "without a rule: invalid_goal" in said
+    assert "into object:1" in said
+    assert "with it: exact" in said
+    assert "ends touching object:1" in said
+
+
+@pytest.mark.slow
+def test_margins_name_the_nearest_pair_and_keep_what_the_checker_keeps(said_by):
+    said = said_by("05")
+    least = float(re.search(r"at least (-?[\d.]+) mm everywhere", said)[1])
+    assert least >= 10.0 - 0.5
+    assert re.search(r"nearest: panda_\w+ to \S+ on edge \d+", said)
+    assert "safe up to" in said
+
+
+@pytest.mark.slow
+def test_your_own_ompl_program_leaves_without_binding_noise(repository, saved_demo_map, tmp_path):
+    script = repository / "examples" / "02_your_own_ompl_program.py"
+    picture = tmp_path / "02.png"
+    done = subprocess.run(
+        [sys.executable, script, "--picture", picture, "--map", saved_demo_map],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    free, edges = re.search(r"(\d+) of (\d+) edges free", done.stdout).groups()
+    assert free == edges
+    assert "nanobind" not in done.stderr
+    assert picture.exists()
