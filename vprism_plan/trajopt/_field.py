@@ -2,6 +2,7 @@
 """Values on a grid as a function with a continuous gradient."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,28 @@ class SplineField:
             return torch.where(outside, total - way.sqrt(), total)
         beyond = total.clamp(max=0.0) + (way + total.clamp(min=0.0).square()).sqrt()
         return torch.where(outside, beyond, total)
+
+    @cached_property
+    def blocks(self) -> Float32[np.ndarray, "g bx by bz"]:
+        """Lower bound of the value in each block of 4 x 4 x 4 cells."""
+        lowest = self.values
+        for axis, n in enumerate(lowest.shape[1:], start=1):
+            starts = 4 * np.arange((n - 1) // 4 + 1)[:, None]
+            # A point between nodes i and i + 1 hears of i - 1 to i + 2.
+            rows = np.clip(starts + np.arange(-1, 6), 0, n - 1)
+            lowest = np.take(lowest, rows, axis=axis).min(axis=axis + 1)
+        return np.ascontiguousarray(lowest)
+
+    def packed(
+        self, margin: float, room: float, planes: Float[np.ndarray, "p 4"]
+    ) -> Float[np.ndarray, " w"]:
+        """Return what the kernels read beside the values: grid, margins (m) and planes.
+
+        `margin` is where the potential begins, `room` what spheres have been grown by.
+        """
+        solid = 1.0 if self.solid_outside else 0.0
+        head = [*self.origin, self.spacing, solid, float(len(planes)), margin, room]
+        return np.array([*head, *np.asarray(planes, dtype=np.float64).reshape(-1)])
 
     def _on(self, device: torch.device, dtype: torch.dtype) -> Tensor:
         if (device, dtype) not in self._tensors:

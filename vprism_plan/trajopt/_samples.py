@@ -14,7 +14,7 @@ from vprism_plan.trajopt.cost import at_least
 
 MAX_TURN = 0.5  # radians of any joint between two samples: keeps arcs from hiding behind chords
 MAX_PARTS = 64  # of an edge: a wild step of an optimiser must not fill the memory
-_SHORT = 1e-6  # metres: below it a way counts quadratically, so that standing still is smooth
+SHORT = 1e-6  # metres: below it a way counts quadratically, so that standing still is smooth
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Samples:
     def ways(self, centers: Float[Tensor, "m s 3"]) -> Float[Tensor, "m s"]:
         """Return half the way from the sample before plus half the way to the next, metres."""
         steps = centers[1:] - centers[:-1]
-        squares = steps.square().sum(dim=-1) + _SHORT**2
-        way = 0.5 * (squares.sqrt() - _SHORT)
+        squares = steps.square().sum(dim=-1) + SHORT**2
+        way = 0.5 * (squares.sqrt() - SHORT)
         joined = (self.trajectory[1:] == self.trajectory[:-1])[:, None]
         way = torch.where(joined, way, torch.zeros_like(way))
         none = way.new_zeros(1, centers.shape[1])
@@ -109,12 +109,12 @@ def sample_paths(robot: Any, q: Float[Tensor, "b time dof"], subdivision: Subdiv
     flat = parts.reshape(-1)
     edge = torch.repeat_interleave(torch.arange(len(flat), device=q.device), flat)
     number = torch.arange(len(edge), device=q.device) - (flat.cumsum(0) - flat)[edge]
-    fraction = number / flat[edge]
+    fraction = number.to(q.dtype) / flat[edge]
     own, previous = span.reshape(-1)[edge], before.reshape(-1)[edge]
     weight = 0.5 * (own + torch.where(number > 0, own, previous))
     if time == 1:
         weight = torch.ones_like(weight)
-    rows = q.reshape(-1, dof)[edge] + fraction[:, None].to(q.dtype) * delta.reshape(-1, dof)[edge]
+    rows = q.reshape(-1, dof)[edge] + fraction[:, None] * delta.reshape(-1, dof)[edge]
     return Samples(rows, edge // time, weight, count)
 
 

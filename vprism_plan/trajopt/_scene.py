@@ -19,8 +19,8 @@ class Scene:
         world: the world.
         robot: the robot.
         rules: sets of objects that may be touched, one per contact rule.
-        sphere_rules: (S,) the rule of each sphere; -1 where no joint moves its link, which
-            is not checked against the world.
+        link_rules: (L,) the rule of each link; -1 where no joint moves it: such links are not
+            checked against the world.
         margin: metres that the checker wants spheres to keep.
         checker: the checker, if there is one.
     """
@@ -28,9 +28,14 @@ class Scene:
     world: Any
     robot: Any
     rules: tuple[frozenset[int], ...]
-    sphere_rules: Int[np.ndarray, " s"]
+    link_rules: Int[np.ndarray, " l"]
     margin: float
     checker: CollisionChecker | None
+
+    @property
+    def sphere_rules(self) -> Int[np.ndarray, " s"]:
+        """(S,) the rule of each sphere; -1 is not checked."""
+        return self.link_rules[self.robot.arrays.sphere_link]
 
     @property
     def radii(self) -> Float[np.ndarray, " s"]:
@@ -72,4 +77,4 @@ def scene_of(world: Any, robot: Any) -> Scene:
         rules, margin, checker = (frozenset[int](),), 0.0, None
         index = np.zeros(len(robot.arrays.link_frame), dtype=np.int64)
     index = np.where(robot.arrays.link_fixed, -1, index)
-    return Scene(world, robot, rules, index[robot.arrays.sphere_link], margin, checker)
+    return Scene(world, robot, rules, index, margin, checker)

@@ -3,24 +3,18 @@
 
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vprism_plan._kernels import trajopt as kernels
+from vprism_plan.trajopt._compiled import PathKernels, checked_backend
 from vprism_plan.trajopt._field import grown, union_field
-from vprism_plan.trajopt._samples import Subdivision, sample_paths
+from vprism_plan.trajopt._potential import hinge
+from vprism_plan.trajopt._samples import Subdivision, require_dof, sample_paths
 from vprism_plan.trajopt._scene import scene_of
 from vprism_plan.trajopt.cost import TrajectoryCost, at_least
-
-
-def hinge(gap: Float[Tensor, "*shape"], margin: float) -> Float[Tensor, "*shape"]:
-    """CHOMP's obstacle potential of a gap, metres: 0 from `margin` on, slope -1 below 0.
-
-    (margin - gap)^2 / (2 margin) between, so that its derivative is continuous (Zucker et
-    al., IJRR 32, 2013, section 3.4).
-    """
-    short = (margin - gap).clamp(min=0.0)
-    return torch.where(gap < 0.0, 0.5 * margin - gap, short.square() / (2.0 * margin))
 
 
 class ClearanceCost(TrajectoryCost):
@@ -55,6 +49,7 @@ class ClearanceCost(TrajectoryCost):
         arc_length: see above.
         spacing: of samples, metres; see `Subdivision`.
         subsamples: parts of every edge, instead of `spacing`.
+        backend: "auto" uses compiled kernels on the CPU; "torch" never does.
         weight, name: see `TrajectoryCost`.
 
     Raises:
@@ -70,6 +65,7 @@ class ClearanceCost(TrajectoryCost):
         arc_length: bool = False,
         spacing: float = 0.05,
         subsamples: int | None = None,
+        backend: str = "auto",
         weight: float = 1.0,
         name: str = "clearance",
     ) -> None:
@@ -82,25 +78,49 @@ class ClearanceCost(TrajectoryCost):
         self._checked = (self._scene.sphere_rules >= 0).nonzero()[0]
         self._planes = self._scene.world.planes
         self._field = union_field(self._scene.fields(), self._planes)
-        self._radii = self._scene.radii[self._checked]
+        self._radii = self._scene.radii
         self._grown = grown(self._radii, self._field.spacing)
+        self._packed = self._field.packed(self.margin, self._scene.margin, self._planes)
+        self._compiled: PathKernels | None = None
+        if checked_backend(backend) == "auto":
+            self._compiled = PathKernels(
+                self.robot, self.subdivision, np.maximum(self._scene.link_rules, 0)
+            )
 
     def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
         """Return the cost without its weight."""
-        samples = sample_paths(self.robot, q.reshape(-1, *q.shape[-2:]), self.subdivision)
-        centers = self.robot.sphere_centers(samples.q)[:, torch.as_tensor(self._checked)]
+        require_dof(self.robot, q)
+        flat = q.reshape(-1, *q.shape[-2:])
+        if self._compiled is not None and q.device.type == "cpu":
+            return self._compiled(flat, self._kernel, self._plain).reshape(q.shape[:-2])
+        return self._plain(flat).reshape(q.shape[:-2])
+
+    def _kernel(
+        self, Q: np.ndarray, delta: np.ndarray, parts: np.ndarray, grad: np.ndarray
+    ) -> float:
+        assert self._compiled is not None
+        kernel = kernels.clearance_by_length if self.arc_length else kernels.clearance
+        return kernel(
+            Q, delta, parts, self._compiled.floats, self._compiled.ints, self._field.values,
+            self._field.blocks, self._packed, self._radii, self._grown, grad,
+        )  # fmt: skip
+
+    def _plain(self, q: Float[Tensor, "b time dof"]) -> Float[Tensor, " b"]:
+        samples = sample_paths(self.robot, q, self.subdivision)
+        checked = torch.as_tensor(self._checked, device=q.device)
+        centers = self.robot.sphere_centers(samples.q)[:, checked]
         short = self._potential(centers)
         if self.arc_length:
-            values = (short * samples.ways(centers)).sum(dim=1)
-        else:
-            values = samples.weight * short.sum(dim=1)
-        return samples.total(values).reshape(q.shape[:-2])
+            return samples.total((short * samples.ways(centers)).sum(dim=1))
+        return samples.total(samples.weight * short.sum(dim=1))
 
     def _potential(self, centers: Float[Tensor, "m s 3"]) -> Float[Tensor, "m s"]:
         rules = self._scene.sphere_rules[self._checked]
-        gap = self._field(centers, rules) - torch.as_tensor(self._grown).to(centers)
+        gap = self._field(centers, rules) - torch.as_tensor(self._grown[self._checked]).to(centers)
         total = hinge(gap, self.margin)
         for row in torch.as_tensor(self._planes).to(centers):
-            away = centers @ row[:3] - row[3] - torch.as_tensor(self._radii).to(centers)
+            away = (
+                centers @ row[:3] - row[3] - torch.as_tensor(self._radii[self._checked]).to(centers)
+            )
             total = total + hinge(away, self.margin)
         return total

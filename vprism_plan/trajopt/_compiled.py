@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Costs by compiled kernels on the CPU, as functions that autograd knows."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from vprism_plan._kernels import trajopt as kernels
+from vprism_plan._threads import run_chunked
+from vprism_plan.collision._packing import pack_robot
+from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan.trajopt._samples import MAX_PARTS, MAX_TURN, Subdivision
+
+# (waypoints, change along each edge, parts of each edge, gradient to add to) -> cost
+Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], float]
+Plain = Callable[[Tensor], Tensor]
+
+BACKENDS = ("auto", "torch")
+_AT_ONCE = 4  # trajectories per piece of work
+
+
+def checked_backend(backend: str) -> str:
+    """Return the name of a backend; ConfigError if there is none of that name."""
+    if backend not in BACKENDS:
+        raise ConfigError(
+            f"backend is {backend!r}; it must be 'auto' (compiled kernels on the CPU, torch "
+            "elsewhere) or 'torch'"
+        )
+    return backend
+
+
+class PathKernels:
+    """A robot packed for the kernels, and how its edges are divided.
+
+    Args:
+        robot: the robot.
+        subdivision: of the edges.
+        rules: (links,) which field each link is compared with; see `pack_robot`.
+    """
+
+    def __init__(
+        self, robot: Any, subdivision: Subdivision, rules: Int[np.ndarray, " l"] | None = None
+    ) -> None:
+        packed = pack_robot(robot.arrays, rules=rules)
+        self.floats, self.ints = packed.floats, packed.ints
+        self._robot = robot
+        self._subdivision = subdivision
+        turns = np.zeros(robot.dof, dtype=np.bool_)
+        turns[robot.arrays.q_index[robot.arrays.kind == 1]] = True
+        self._turns = turns
+
+    def divide(
+        self, Q: Float[np.ndarray, "time dof"]
+    ) -> tuple[Float[np.ndarray, "steps dof"], Int[np.ndarray, " steps"]]:
+        """Return the change of the joints along each edge, and into how many it is divided."""
+        delta = np.diff(Q, axis=0)
+        if self._robot.continuous.any():
+            turns = np.where(self._robot.continuous, np.round(delta / (2.0 * math.pi)), 0.0)
+            delta -= 2.0 * math.pi * turns
+        division = self._subdivision
+        parts = np.full(len(delta), division.parts or 1, dtype=np.int64)
+        if division.parts is None and len(delta):
+            kernels.subdivide(
+                Q, delta, self.floats, self.ints, self._turns,
+                division.spacing, MAX_TURN, MAX_PARTS, parts,
+            )  # fmt: skip
+        return delta, parts
+
+    def __call__(
+        self, q: Float[Tensor, "b time dof"], kernel: Kernel, plain: Plain
+    ) -> Float[Tensor, " b"]:
+        """Return the cost of each trajectory; second derivatives are those of `plain`.
+
+        Raises:
+            RobotError: q is not finite.
+        """
+        if not bool(torch.isfinite(q.detach()).all()):
+            raise RobotError("q holds NaN or infinite values; give finite joint values")
+
+        def work(
+            Q: Float[np.ndarray, "b time dof"],
+        ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b time dof"]]:
+            values, grad = np.empty(len(Q)), np.zeros(Q.shape)
+
+            def piece(part: slice) -> None:
+                for b in range(part.start, part.stop):
+                    values[b] = kernel(Q[b], *self.divide(Q[b]), grad[b])
+
+            run_chunked(piece, len(Q), _AT_ONCE)
+            return values, grad
+
+        return _Compiled.apply(q, work, plain)
+
+
+class _Compiled(torch.autograd.Function):
+    """Value and gradient at once; differentiated twice, it is the plain graph instead."""
+
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, work: Any, plain: Plain) -> Tensor:
+        Q = np.ascontiguousarray(q.detach().to(torch.float64).numpy())
+        values, grad = work(Q)
+        ctx.plain = plain
+        ctx.save_for_backward(q, torch.from_numpy(grad))
+        return torch.from_numpy(values).to(q.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
+        (output,) = grad_outputs
+        q, grad = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            (found,) = torch.autograd.grad(ctx.plain(q), q, output, create_graph=True)
+            return found, None, None
+        return (output.to(torch.float64)[:, None, None] * grad).to(q.dtype), None, None
