@@ -158,6 +158,35 @@ class Mesh:
 
 
 @dataclass(frozen=True)
+class View:
+    """Look at a map, and at a plan, in the browser; Ctrl-C ends it.
+
+    Surfaces of the objects at any P(occupied), the observed points, the entropy as a cloud and
+    as a slice; the robot along the planned trajectory, or moved by hand. Needs the extra
+    `viewer`.
+    """
+
+    input: Positional[Annotated[Path, arg(metavar="MAP_OR_PLAN")]]
+    """A .safetensors map, or the output folder of `plan` or `demo`."""
+    robot: Annotated[Path | None, arg(metavar="URDF")] = None
+    """Robot description; for a plan, the one it was made with. Without it no robot is shown."""
+    base_xyz: Annotated[Triple | None, _XYZ] = None
+    """Position of the robot's root link in the world (m); default: that of the plan, else the
+    place that `plan` chooses beside the objects."""
+    base_yaw: Annotated[float | None, arg(metavar="RAD")] = None
+    """Turn of the root link about world z (rad); default: that of the plan, else facing the
+    objects."""
+    level: float = 0.5
+    """P(occupied) at the surfaces, to begin with."""
+    host: str = "127.0.0.1"
+    """Address to listen at; 0.0.0.0 lets other machines connect."""
+    port: int = 8080
+    """Port to listen at; if it is busy, the next free one."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True)
 class Eval:
     """Compare methods or checkers on generated scenes whose truth is known; write a report.
 
@@ -194,12 +223,13 @@ class Eval:
     """Print one JSON object instead of text."""
 
 
-Command = Demo | Map | Plan | Query | Mesh | Eval
+Command = Demo | Map | Plan | Query | Mesh | View | Eval
 CommandLine = AvoidSubcommands[
     Annotated[Demo, subcommand("demo")]
     | Annotated[Map, subcommand("map")]
     | Annotated[Plan, subcommand("plan")]
     | Annotated[Query, subcommand("query")]
     | Annotated[Mesh, subcommand("mesh")]
+    | Annotated[View, subcommand("view")]
     | Annotated[Eval, subcommand("eval")]
 ]

@@ -1,31 +1,29 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a parsed command to the code that runs it, loaded only then."""
 
-from vprism_plan.cli._commands import Command, Demo, Eval, Map, Mesh, Query
+from importlib import import_module
+
+from vprism_plan.cli._commands import Command, Demo, Eval, Map, Mesh, Plan, Query, View
 from vprism_plan.cli._console import Console
+
+# Command -> module of this folder and its function (command, console) -> exit code.
+_RUNNERS: dict[type, tuple[str, str]] = {
+    Map: ("_maps", "run_map"),
+    Mesh: ("_maps", "run_mesh"),
+    Plan: ("_motions", "run_plan"),
+    Query: ("_query", "run_query"),
+    View: ("_view", "run_view"),
+    Eval: ("_evaluate", "run_eval"),
+}
 
 
 def run(command: Command) -> int:
     """Run one command; return its exit code."""
     console = Console(as_json=command.json)
-    if isinstance(command, Map | Mesh):
-        from vprism_plan.cli import _maps
-
-        if isinstance(command, Map):
-            return _maps.run_map(command, console)
-        return _maps.run_mesh(command, console)
-    if isinstance(command, Query):
-        from vprism_plan.cli._query import run_query
-
-        return run_query(command, console)
-    if isinstance(command, Eval):
-        from vprism_plan.cli._evaluate import run_eval
-
-        return run_eval(command, console)
     if isinstance(command, Demo):
         from vprism_plan.demo import run_demo
 
         return run_demo(command.output, command.seed, console)
-    from vprism_plan.cli._motions import run_plan
-
-    return run_plan(command, console)
+    module, function = _RUNNERS[type(command)]
+    code: int = getattr(import_module(f"vprism_plan.cli.{module}"), function)(command, console)
+    return code

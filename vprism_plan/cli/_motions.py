@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vprism_plan.cli._commands import Plan, Query
+from vprism_plan.cli._commands import Plan, Query, View
 from vprism_plan.cli._console import Console
 from vprism_plan.cli._maps import fit, observe
 from vprism_plan.cli._outcome import Situation, report_plan
@@ -159,7 +159,7 @@ def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
 
 
 def standing(
-    command: Plan | Query, robot: "Robot", world: "World", around: Surroundings
+    command: Plan | Query | View, robot: "Robot", world: "World", around: Surroundings
 ) -> "Robot":
     """Return the robot on the base that was given, else on the first free place."""
     if command.base_xyz is not None:
