@@ -8,8 +8,10 @@ from vprism_plan.errors import PlanningError
 from vprism_plan.trajopt.clearance import ClearanceCost
 from vprism_plan.trajopt.cost import SumCost, TrajectoryCost
 from vprism_plan.trajopt.joint_costs import JointLimitCost, SmoothnessCost
+from vprism_plan.trajopt.self_collision import SelfCollisionCost
 
 _MARGIN = 0.02  # metres beyond the checker's margin from which obstacles push
+_APART = 0.005  # the same of links from each other
 _LIMITS = 0.02  # the same of joint limits, radians or metres
 _CLEAR, _OWN, _WITHIN = 300.0, 300.0, 300.0  # weights against squared velocity
 _BEND = 1e-3  # weight of squared acceleration: corners cost, curves hardly do
@@ -59,5 +61,6 @@ def _beyond(checker: Any, kept: float | None) -> float:
 def _keep_off(checker: Any, margin: float) -> list[TrajectoryCost]:
     return [
         ClearanceCost(checker, margin=margin, weight=_CLEAR),
+        SelfCollisionCost(checker, margin=_APART, weight=_OWN),
         JointLimitCost(checker.robot, margin=_LIMITS, weight=_WITHIN),
     ]
