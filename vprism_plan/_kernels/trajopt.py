@@ -129,6 +129,23 @@ def _joint_gradient(T, C, F, active, rf, ri, W, tau):
 
 
 @njit(cache=True, nogil=True)
+def place_all(Q, rf, ri, T, C):
+    """Place frames T (n, frames, 12) and sphere centres C (n, 3, spheres) for each row of Q."""
+    L = np.empty((ri[2], 3))
+    for n in range(len(Q)):
+        _place(Q[n], rf, ri, T[n], L, C[n])
+
+
+@njit(cache=True, nogil=True)
+def pull_all(T, C, F, rf, ri, grad):
+    """Fill grad (n, dof) with what forces F (n, 3, spheres) at the centres make."""
+    active = np.ones(ri[2], np.bool_)
+    W = np.empty((ri[0], 6))
+    for n in range(len(F)):
+        _joint_gradient(T[n], C[n], F[n], active, rf, ri, W, grad[n])
+
+
+@njit(cache=True, nogil=True)
 def subdivide(Q, delta, rf, ri, turns, spacing, max_turn, most, parts):
     """Fill parts (T - 1,): into how many each edge of a trajectory is divided."""
     n = ri[1]
@@ -484,6 +501,86 @@ def _segment(C, value, G, F, now):
     return total
 
 
+@njit(cache=True, nogil=True)
+def _soft_contact(x, cut):
+    """log(1 + exp(x)) (1 - exp(-(x + cut)))^2 and its slope; 0 for x <= -cut."""
+    if x <= -cut:
+        return 0.0, 0.0
+    e = math.exp(-abs(x))
+    value = max(x, 0.0) + math.log1p(e)
+    steep = 1.0 / (1.0 + e) if x > 0.0 else e / (1.0 + e)
+    gone = math.exp(-(x + cut))
+    kept = 1.0 - gone
+    return value * kept * kept, kept * (steep * kept + 2.0 * gone * value)
+
+
+@njit(cache=True, nogil=True)
+def certain_hazards(centers, rules, V, E, wf, radii, grown, soft, cut, value, slopes):
+    """Hazard of contact with the field and the planes for spheres (n, s, 3), and its slopes."""
+    slope = np.empty(3)
+    far = cut * soft
+    for n in range(centers.shape[0]):
+        for s in range(centers.shape[1]):
+            x = centers[n, s, 0]
+            y = centers[n, s, 1]
+            z = centers[n, s, 2]
+            value[n, s] = 0.0
+            slopes[n, s] = 0.0
+            if _block_bound(E, rules[s], wf, V, x, y, z) < grown[s] + far:
+                away = _distance(V, rules[s], wf, wf[3], wf[4] > 0.0, x, y, z, slope)
+                value[n, s], steep = _soft_contact((grown[s] - away) / soft, cut)
+                for a in range(3):
+                    slopes[n, s, a] = -steep / soft * slope[a]
+            for p in range(int(wf[5])):
+                o = 8 + 4 * p
+                gap = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3] - radii[s]
+                if gap < far:
+                    more, steep = _soft_contact(-gap / soft, cut)
+                    value[n, s] += more
+                    for a in range(3):
+                        slopes[n, s, a] -= steep / soft * wf[o + a]
+
+
+@njit(cache=True, nogil=True)
+def ball_averages(centers, rules, radii, V, grid, nodes, weights, value, slopes):
+    """Average of a spline over balls around the centres (n, s, 3), with its slopes.
+
+    grid: origin x, y, z, spacing. Beyond the grid the spline is 0.
+    nodes (p, 3), weights (p,): a quadrature of the unit ball.
+    """
+    h = grid[3]
+    slope = np.empty(3)
+    top = np.empty(3)
+    for a in range(3):
+        top[a] = V.shape[a + 1] - 1.0
+    for n in range(centers.shape[0]):
+        for s in range(centers.shape[1]):
+            total = 0.0
+            for a in range(3):
+                slopes[n, s, a] = 0.0
+            gx = (centers[n, s, 0] - grid[0]) / h
+            gy = (centers[n, s, 1] - grid[1]) / h
+            gz = (centers[n, s, 2] - grid[2]) / h
+            r = radii[s] / h
+            rule = rules[s]
+            if (
+                gx < -r or gy < -r or gz < -r
+                or gx > top[0] + r or gy > top[1] + r or gz > top[2] + r
+            ):  # fmt: skip
+                value[n, s] = 0.0
+                continue
+            for p in range(len(weights)):
+                x = gx + r * nodes[p, 0]
+                y = gy + r * nodes[p, 1]
+                z = gz + r * nodes[p, 2]
+                if x <= 0.0 or y <= 0.0 or z <= 0.0 or x >= top[0] or y >= top[1] or z >= top[2]:
+                    continue
+                total += weights[p] * _spline(V, rule, x, y, z, h, slope)
+                for a in range(3):
+                    slopes[n, s, a] += weights[p] * slope[a]
+            value[n, s] = total
+
+
 # --- self-collision ----------------------------------------------------------------
 
 
@@ -591,3 +688,214 @@ def self_collision(Q, delta, parts, rf, ri, margin, kept, grad):
                     tau[j] *= w
                 _add(tau, e, fraction, grad)
     return total
+
+
+# --- draws -------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _taps(v, n, index, weight, steep):
+    """The three nodes of a quadratic B-spline along one axis, their weights and slopes."""
+    i = min(int(v + 0.5), n - 1)
+    t = v - i
+    index[0] = max(i - 1, 0)
+    index[1] = i
+    index[2] = min(i + 1, n - 1)
+    weight[0] = 0.5 * (0.5 - t) * (0.5 - t)
+    weight[1] = 0.75 - t * t
+    weight[2] = 0.5 * (0.5 + t) * (0.5 + t)
+    steep[0] = t - 0.5
+    steep[1] = -2.0 * t
+    steep[2] = t + 0.5
+
+
+@njit(cache=True, nogil=True)
+def _draw_distances(V, rule, index, weight, unit, out):
+    """Spline of every draw's signed distance, metres."""
+    out[:] = 0.0
+    for a in range(3):
+        for b in range(3):
+            across = unit * weight[0, a] * weight[1, b]
+            for c in range(3):
+                w = across * weight[2, c]
+                row = V[rule, index[0, a], index[1, b], index[2, c]]
+                for s in range(len(out)):
+                    out[s] += w * row[s]
+
+
+@njit(cache=True, nogil=True)
+def _draw_slope(V, rule, index, weight, steep, unit, share, slope):
+    """Slope of the sum over draws of share times distance."""
+    slope[:] = 0.0
+    for a in range(3):
+        for b in range(3):
+            for c in range(3):
+                row = V[rule, index[0, a], index[1, b], index[2, c]]
+                total = 0.0
+                for s in range(len(share)):
+                    total += share[s] * row[s]
+                total *= unit
+                slope[0] += steep[0, a] * weight[1, b] * weight[2, c] * total
+                slope[1] += weight[0, a] * steep[1, b] * weight[2, c] * total
+                slope[2] += weight[0, a] * weight[1, b] * steep[2, c] * total
+
+
+@njit(cache=True, nogil=True)
+def _near_draws(centers, rules, grown, E, grid, top, reach, rows):
+    """Fill rows (n, 2) with (sample, sphere) where any draw may count; how many there are."""
+    found = 0
+    for i in range(centers.shape[0]):
+        for s in range(centers.shape[1]):
+            x = (centers[i, s, 0] - grid[0]) / grid[3]
+            y = (centers[i, s, 1] - grid[1]) / grid[3]
+            z = (centers[i, s, 2] - grid[2]) / grid[3]
+            if x < 0.0 or y < 0.0 or z < 0.0 or x > top[0] or y > top[1] or z > top[2]:
+                continue
+            if E[rules[s], int(x) >> 2, int(y) >> 2, int(z) >> 2] < grown[s] + reach:
+                if len(rows):
+                    rows[found, 0] = i
+                    rows[found, 1] = s
+                found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _near_certain(centers, rules, grown, radii, V, E, wf, reach, which, depth, slopes):
+    """Fill, per contact with what is certain, (sample, sphere), depth and its slope; count."""
+    found = 0
+    kept = len(depth) > 0
+    slope = np.empty(3)
+    for i in range(centers.shape[0]):
+        for s in range(centers.shape[1]):
+            x = centers[i, s, 0]
+            y = centers[i, s, 1]
+            z = centers[i, s, 2]
+            if _block_bound(E, rules[s], wf, V, x, y, z) < grown[s] + reach:
+                if kept:
+                    value = _distance(V, rules[s], wf, wf[3], wf[4] > 0.0, x, y, z, slope)
+                    which[found, 0] = i
+                    which[found, 1] = s
+                    depth[found] = grown[s] - value
+                    for a in range(3):
+                        slopes[found, a] = -slope[a]
+                found += 1
+            for p in range(int(wf[5])):
+                o = 8 + 4 * p
+                value = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3]
+                if value < radii[s] + reach:
+                    if kept:
+                        which[found, 0] = i
+                        which[found, 1] = s
+                        depth[found] = radii[s] - value
+                        for a in range(3):
+                            slopes[found, a] = -wf[o + a]
+                    found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def risk(
+    centers, rules, grown, radii, D, DE, grid, unit, V, E, wf, any_certain, tau, cut, force
+):  # fmt: skip
+    """Minus log of the share of draws that survive one trajectory; fills force (n, s, 3).
+
+    centers (n, s, 3): of the spheres at all samples. D (g, x, y, z, S) int16: signed distances
+    of every draw in steps of `unit` metres; DE: least of any draw per block, metres; grid:
+    origin, spacing. V, E, wf: what is certain, as for `clearance`; planes use radii.
+    With depth m, a contact adds exp(m / tau) (1 - exp(-(m + cut) / tau))^2 to the odds of every
+    draw it concerns, nothing for m <= -cut; a draw survives with probability 1 / (1 + odds).
+    """
+    S = D.shape[4]
+    top = np.empty(3)
+    for a in range(3):
+        top[a] = D.shape[a + 1] - 1.0
+    none = np.empty((0, 2), np.int64)
+    count = _near_draws(centers, rules, grown, DE, grid, top, cut, none)
+    rows = np.empty((count, 2), np.int64)
+    if count:
+        _near_draws(centers, rules, grown, DE, grid, top, cut, rows)
+    sure = 0
+    if any_certain:
+        sure = _near_certain(
+            centers, rules, grown, radii, V, E, wf, cut, none, np.empty(0), np.empty((0, 3))
+        )
+    which = np.empty((sure, 2), np.int64)
+    hit = np.empty(sure)
+    slopes = np.empty((sure, 3))
+    if sure:
+        _near_certain(centers, rules, grown, radii, V, E, wf, cut, which, hit, slopes)
+
+    index = np.empty((3, 3), np.int64)
+    weight = np.empty((3, 3))
+    steep = np.empty((3, 3))
+    depth = np.empty((count, S))
+    shift = np.zeros(S)
+    highest = 0.0
+    for c in range(sure):
+        highest = max(highest, hit[c] / tau)
+    shift[:] = highest
+    for n in range(count):
+        s = rows[n, 1]
+        for a in range(3):
+            v = (centers[rows[n, 0], s, a] - grid[a]) / grid[3]
+            _taps(v, D.shape[a + 1], index[a], weight[a], steep[a])
+        _draw_distances(D, rules[s], index, weight, unit, depth[n])
+        for d in range(S):
+            depth[n, d] = grown[s] - depth[n, d]
+            shift[d] = max(shift[d], depth[n, d] / tau)
+    odds = np.zeros(S)
+    for n in range(count):
+        for d in range(S):
+            m = depth[n, d]
+            if m > -cut:
+                odds[d] += math.exp(m / tau - shift[d]) * (1.0 - math.exp(-(m + cut) / tau)) ** 2
+    for c in range(sure):
+        if hit[c] > -cut:
+            soft = (1.0 - math.exp(-(hit[c] + cut) / tau)) ** 2
+            for d in range(S):
+                odds[d] += math.exp(hit[c] / tau - shift[d]) * soft
+
+    # log(1 + odds) of each draw, and the share of each in the survivors
+    lowest = np.inf
+    loss = np.empty(S)
+    for d in range(S):
+        odds[d] += math.exp(-shift[d])
+        loss[d] = shift[d] + math.log(odds[d])
+        lowest = min(lowest, loss[d])
+    total = 0.0
+    for d in range(S):
+        total += math.exp(lowest - loss[d])
+    share = np.empty(S)
+    for d in range(S):
+        share[d] = math.exp(lowest - loss[d]) / (total * odds[d] * tau)
+
+    slope = np.empty(3)
+    pull = np.empty(S)
+    for n in range(count):
+        s = rows[n, 1]
+        strong = 0.0
+        for d in range(S):
+            m = depth[n, d]
+            pull[d] = 0.0
+            if m > -cut:
+                fall = 1.0 - math.exp(-2.0 * (m + cut) / tau)
+                pull[d] = share[d] * math.exp(m / tau - shift[d]) * fall
+                strong = max(strong, pull[d])
+        if strong == 0.0:
+            continue
+        for a in range(3):
+            v = (centers[rows[n, 0], s, a] - grid[a]) / grid[3]
+            _taps(v, D.shape[a + 1], index[a], weight[a], steep[a])
+        _draw_slope(D, rules[s], index, weight, steep, unit / grid[3], pull, slope)
+        for a in range(3):
+            force[rows[n, 0], s, a] -= slope[a]
+    for c in range(sure):
+        if hit[c] <= -cut:
+            continue
+        fall = 1.0 - math.exp(-2.0 * (hit[c] + cut) / tau)
+        strong = 0.0
+        for d in range(S):
+            strong += share[d] * math.exp(hit[c] / tau - shift[d])
+        for a in range(3):
+            force[which[c, 0], which[c, 1], a] += fall * strong * slopes[c, a]
+    return lowest - math.log(total / S)

@@ -117,6 +117,19 @@ class VPrismMap:
             return prediction.class_probabilities(*self._torch_moments(points)[:2]).to(points.dtype)
         return np.exp(self._log_probabilities(points))
 
+    def log_proba_and_support(self, points: Any) -> tuple[Any, Any]:
+        """Return log P(class | x), (N, K), and the kernel mass, (N,), at points (N, 3) m.
+
+        Arguments as for `predict_proba`. Keeps its digits, and its gradient, where a
+        probability has rounded to 0 or 1.
+        """
+        if isinstance(points, Tensor):
+            mean, variance, support = self._torch_moments(points)
+            log_p = prediction.class_log_probabilities(mean, variance)
+            return log_p.to(points.dtype), support.to(points.dtype)
+        moments = self._moments(_checked_points(points))
+        return self._normalised(*moments[:2]), moments[2]
+
     def occupancy(self, points: Any) -> Any:
         """Return P(occupied) = 1 - P(class 0) for points (N, 3) m: (N,)."""
         if isinstance(points, Tensor):
@@ -229,7 +242,11 @@ class VPrismMap:
         return mean, variance, support
 
     def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
-        mean, variance, _ = self._moments(_checked_points(points))
+        return self._normalised(*self._moments(_checked_points(points))[:2])
+
+    def _normalised(
+        self, mean: Float[np.ndarray, "n k"], variance: Float[np.ndarray, "n k"]
+    ) -> Float[np.ndarray, "n k"]:
         out = np.empty_like(mean)
 
         def chunk(piece: slice) -> None:

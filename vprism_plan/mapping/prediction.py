@@ -33,11 +33,18 @@ def class_probabilities(
     return torch.softmax(log_scores(mean, variance), dim=1)
 
 
+def class_log_probabilities(
+    mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
+) -> Float[Tensor, "n k"]:
+    """Return the logarithm of the normalised prediction."""
+    return torch.log_softmax(log_scores(mean, variance), dim=1)
+
+
 def class_entropy(
     mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
 ) -> Float[Tensor, " n"]:
     """Return -sum_k p_k ln p_k, nats."""
-    log_p = torch.log_softmax(log_scores(mean, variance), dim=1)
+    log_p = class_log_probabilities(mean, variance)
     return -(log_p.exp() * log_p).sum(dim=1)
 
 

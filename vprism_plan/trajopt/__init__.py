@@ -9,8 +9,11 @@ from vprism_plan.trajopt.joint_costs import JointLimitCost as JointLimitCost
 from vprism_plan.trajopt.joint_costs import SmoothnessCost as SmoothnessCost
 from vprism_plan.trajopt.optimizer import optimize as optimize
 from vprism_plan.trajopt.pose_cost import PoseCost as PoseCost
+from vprism_plan.trajopt.posterior_costs import EntropyCost as EntropyCost
+from vprism_plan.trajopt.posterior_costs import OccupancyCost as OccupancyCost
 from vprism_plan.trajopt.result import History as History
 from vprism_plan.trajopt.result import OptimizeReport as OptimizeReport
 from vprism_plan.trajopt.result import OptimizeResult as OptimizeResult
 from vprism_plan.trajopt.result import SeedReport as SeedReport
+from vprism_plan.trajopt.risk_cost import RiskCost as RiskCost
 from vprism_plan.trajopt.self_collision import SelfCollisionCost as SelfCollisionCost

@@ -19,9 +19,12 @@ from vprism_plan.trajopt._samples import MAX_PARTS, MAX_TURN, Subdivision
 # (waypoints, change along each edge, parts of each edge, gradient to add to) -> cost
 Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], float]
 Plain = Callable[[Tensor], Tensor]
+Pull = Callable[[np.ndarray], np.ndarray]
+Work = Callable[[np.ndarray], tuple[np.ndarray, Pull]]
 
 BACKENDS = ("auto", "torch")
 _AT_ONCE = 4  # trajectories per piece of work
+_ROWS_AT_ONCE = 512
 
 
 def checked_backend(backend: str) -> str:
@@ -82,9 +85,7 @@ class PathKernels:
         if not bool(torch.isfinite(q.detach()).all()):
             raise RobotError("q holds NaN or infinite values; give finite joint values")
 
-        def work(
-            Q: Float[np.ndarray, "b time dof"],
-        ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, "b time dof"]]:
+        def work(Q: np.ndarray) -> tuple[np.ndarray, Pull]:
             values, grad = np.empty(len(Q)), np.zeros(Q.shape)
 
             def piece(part: slice) -> None:
@@ -92,27 +93,66 @@ class PathKernels:
                     values[b] = kernel(Q[b], *self.divide(Q[b]), grad[b])
 
             run_chunked(piece, len(Q), _AT_ONCE)
-            return values, grad
+            return values, lambda output: output[:, None, None] * grad
 
-        return _Compiled.apply(q, work, plain)
+        return compiled(q, work, plain)
+
+    def sphere_centers(self, q: Float[Tensor, "n dof"]) -> Float[Tensor, "n s 3"]:
+        """Return `robot.sphere_centers`, metres, differentiable in q to any order."""
+        kernel_arguments = self.floats, self.ints
+
+        def work(Q: np.ndarray) -> tuple[np.ndarray, Pull]:
+            frames = np.empty((len(Q), int(self.ints[0]), 12))
+            centers = np.empty((len(Q), 3, int(self.ints[1])))
+
+            def piece(part: slice) -> None:
+                kernels.place_all(Q[part], *kernel_arguments, frames[part], centers[part])
+
+            run_chunked(piece, len(Q), _ROWS_AT_ONCE)
+
+            def pull(output: np.ndarray) -> np.ndarray:
+                grad = np.empty(Q.shape)
+                forces = np.ascontiguousarray(np.moveaxis(output, 1, 2))
+
+                def piece(part: slice) -> None:
+                    kernels.pull_all(
+                        frames[part], centers[part], forces[part], *kernel_arguments, grad[part]
+                    )
+
+                run_chunked(piece, len(Q), _ROWS_AT_ONCE)
+                return grad
+
+            return np.moveaxis(centers, 1, 2), pull
+
+        return compiled(q, work, self._robot.sphere_centers)
+
+
+def compiled(x: Tensor, work: Work, plain: Plain) -> Tensor:
+    """Return what `work` makes of an array, as a function of the tensor x on the CPU.
+
+    Args:
+        x: any float dtype; `work` gets float64.
+        work: returns a value and what pulls a gradient of it back to x.
+        plain: the same in torch, which is asked for second derivatives.
+    """
+    return _Compiled.apply(x, work, plain)
 
 
 class _Compiled(torch.autograd.Function):
-    """Value and gradient at once; differentiated twice, it is the plain graph instead."""
+    """Value and gradient from kernels; differentiated twice, it is the plain graph instead."""
 
     @staticmethod
-    def forward(ctx: Any, q: Tensor, work: Any, plain: Plain) -> Tensor:
-        Q = np.ascontiguousarray(q.detach().to(torch.float64).numpy())
-        values, grad = work(Q)
+    def forward(ctx: Any, x: Tensor, work: Work, plain: Plain) -> Tensor:
+        values, ctx.pull = work(np.ascontiguousarray(x.detach().to(torch.float64).numpy()))
         ctx.plain = plain
-        ctx.save_for_backward(q, torch.from_numpy(grad))
-        return torch.from_numpy(values).to(q.dtype)
+        ctx.save_for_backward(x)
+        return torch.from_numpy(np.ascontiguousarray(values)).to(x.dtype)
 
     @staticmethod
     def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
         (output,) = grad_outputs
-        q, grad = ctx.saved_tensors
+        (x,) = ctx.saved_tensors
         if torch.is_grad_enabled():
-            (found,) = torch.autograd.grad(ctx.plain(q), q, output, create_graph=True)
+            (found,) = torch.autograd.grad(ctx.plain(x), x, output, create_graph=True)
             return found, None, None
-        return (output.to(torch.float64)[:, None, None] * grad).to(q.dtype), None, None
+        return torch.from_numpy(ctx.pull(output.to(torch.float64).numpy())).to(x.dtype), None, None

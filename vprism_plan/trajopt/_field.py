@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Values on a grid as a function with a continuous gradient."""
 
+import operator
+import weakref
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -13,6 +15,8 @@ from torch import Tensor
 from vprism_plan.world.distance import NodeDistances, finish
 from vprism_plan.world.grid import Grid
 
+# Unions by their first field: optimisers make many costs of one world.
+_unions: Any = weakref.WeakKeyDictionary()
 # Variance of the spline's weights about the point, in squared grid steps, three axes.
 SPREAD = 0.75
 
@@ -56,20 +60,11 @@ class SplineField:
         device, dtype = points.device, points.dtype
         values = self._on(device, dtype)
         sizes = self.values.shape[1:]
-        size = torch.tensor(sizes, device=device)
+        top = torch.tensor(sizes, device=device).to(dtype) - 1.0
         origin = torch.as_tensor(self.origin, dtype=dtype, device=device)
         scaled = (points - origin) / self.spacing
-        top = (size - 1).to(dtype)
         inside = torch.minimum(scaled.clamp(min=0.0), top)
-        node = (inside.detach() + 0.5).floor().long()
-        node = torch.minimum(node, size - 1)
-        t = inside - node
-        weights = torch.stack(
-            [0.5 * (0.5 - t).square(), 0.75 - t.square(), 0.5 * (0.5 + t).square()], dim=-1
-        )
-        around = torch.minimum(
-            (node[..., None] + torch.arange(-1, 2, device=device)).clamp(min=0), size[:, None] - 1
-        )
+        around, weights = spline_weights(inside, sizes)
         first = torch.as_tensor(rules, device=device) * int(np.prod(sizes))
         total = torch.zeros_like(points[..., 0])
         for i in range(3):
@@ -118,6 +113,20 @@ class SplineField:
         return {**self.__dict__, "_tensors": {}}
 
 
+def spline_weights(
+    inside: Float[Tensor, "*shape 3"], sizes: tuple[int, ...]
+) -> tuple[Int[Tensor, "*shape 3 3"], Float[Tensor, "*shape 3 3"]]:
+    """Indices of the three nodes per axis around points of a grid, and their weights."""
+    size = torch.tensor(sizes, device=inside.device)
+    node = torch.minimum((inside.detach() + 0.5).floor().long(), size - 1)
+    t = inside - node
+    weights = torch.stack(
+        [0.5 * (0.5 - t).square(), 0.75 - t.square(), 0.5 * (0.5 + t).square()], dim=-1
+    )
+    around = (node[..., None] + torch.arange(-1, 2, device=inside.device)).clamp(min=0)
+    return torch.minimum(around, size[:, None] - 1), weights
+
+
 def grown(radii: Float[np.ndarray, " s"], spacing: float) -> Float[np.ndarray, " s"]:
     """Return what a spline of distances must exceed for a ball to be clear, metres.
 
@@ -133,6 +142,17 @@ def union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spli
     table: depth is the distance to what is outside of both. Without this, the pull of the
     object's underside and the push of the table cancel.
     """
+    field = fields[0]
+    key = np.asarray(planes, dtype=np.float64).tobytes()
+    for others, made in _unions.setdefault(field, {}).get(key, []):
+        if len(others) == len(fields) - 1 and all(map(operator.is_, others, fields[1:])):
+            return made
+    made = _union_field(fields, planes)
+    _unions[field].setdefault(key, []).append((tuple(fields[1:]), made))
+    return made
+
+
+def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> SplineField:
     field = fields[0]
     spacing = float(field.spacing)
     shape = field.distance.shape

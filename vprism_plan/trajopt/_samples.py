@@ -2,6 +2,7 @@
 """Configurations between waypoints, so that costs see what lies between them."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,11 +96,24 @@ def path_steps(
     return delta - 2.0 * math.pi * turns
 
 
-def sample_paths(robot: Any, q: Float[Tensor, "b time dof"], subdivision: Subdivision) -> Samples:
-    """Divide the edges of trajectories as the subdivision says."""
+def sample_paths(
+    robot: Any,
+    q: Float[Tensor, "b time dof"],
+    subdivision: Subdivision,
+    centers_of: Callable[[Tensor], Tensor] | None = None,
+) -> Samples:
+    """Divide the edges of trajectories as the subdivision says.
+
+    Args:
+        robot: the robot.
+        q: waypoints.
+        subdivision: of the edges.
+        centers_of: (n, dof) to sphere centres (n, S, 3); None is the robot's own.
+    """
+    centers_of = robot.sphere_centers if centers_of is None else centers_of
     count, time, dof = q.shape
     delta = path_steps(robot, q)
-    parts = _parts(robot, q.detach(), delta.detach(), subdivision)
+    parts = _parts(robot, q.detach(), delta.detach(), subdivision, centers_of)
     # The last waypoint is an edge that goes nowhere.
     parts = torch.cat([parts, parts.new_ones(count, 1)], dim=1)
     delta = torch.cat([delta, torch.zeros_like(q[:, :1])], dim=1)
@@ -123,6 +137,7 @@ def _parts(
     q: Float[Tensor, "b time dof"],
     delta: Float[Tensor, "b steps dof"],
     subdivision: Subdivision,
+    centers_of: Callable[[Tensor], Tensor],
 ) -> Int[Tensor, "b steps"]:
     if subdivision.parts is not None:
         return torch.full(delta.shape[:2], subdivision.parts, dtype=torch.int64, device=q.device)
@@ -130,7 +145,7 @@ def _parts(
         return torch.zeros(delta.shape[:2], dtype=torch.int64, device=q.device)
     arrays = robot.arrays
     with torch.no_grad():
-        centers = robot.sphere_centers(q)
+        centers = centers_of(q.reshape(-1, q.shape[-1])).reshape(*q.shape[:2], -1, 3)
     way = centers.diff(dim=1).square().sum(dim=-1).amax(dim=-1).sqrt()
     turning = torch.zeros(q.shape[-1], dtype=torch.bool, device=q.device)
     turning[torch.as_tensor(arrays.q_index[arrays.kind == 1], device=q.device)] = True

@@ -16,7 +16,7 @@ class Scene:
     """A robot among obstacles, as one checker (or a checker without settings) sees them.
 
     Attributes:
-        world: the world.
+        world: the world; None where there is only a map.
         robot: the robot.
         rules: sets of objects that may be touched, one per contact rule.
         link_rules: (L,) the rule of each link; -1 where no joint moves it: such links are not
@@ -56,7 +56,7 @@ class Scene:
 
 
 def scene_of(world: Any, robot: Any) -> Scene:
-    """Put a scene together from a checker, or from a world and a robot.
+    """Put a scene together from a checker, or from a world (or None) and a robot.
 
     Raises:
         ConfigError: a robot is missing, or another one than the checker's is given.
@@ -78,3 +78,19 @@ def scene_of(world: Any, robot: Any) -> Scene:
         index = np.zeros(len(robot.arrays.link_frame), dtype=np.int64)
     index = np.where(robot.arrays.link_fixed, -1, index)
     return Scene(world, robot, rules, index, margin, checker)
+
+
+def map_and_scene(world: Any, robot: Any) -> tuple[Any, Scene]:
+    """Return the map of a checker, a world, or itself, and the scene: without a world for a map.
+
+    Raises:
+        ConfigError: it is none of them, or see `scene_of`.
+    """
+    if isinstance(world, CollisionChecker) or hasattr(world, "certain_field"):
+        scene = scene_of(world, robot)
+        return scene.world.map, scene
+    if not hasattr(world, "log_proba_and_support"):
+        raise ConfigError(
+            f"got a {type(world).__name__}; pass a VPrismMap, a World or a CollisionChecker"
+        )
+    return world, scene_of(None, robot)
