@@ -59,6 +59,11 @@ class PathRisk:
                 worlds.bake(without=ids)
 
     @property
+    def setting(self) -> Setting:
+        """What probabilities of touching are counted with."""
+        return self._at
+
+    @property
     def fields(self) -> list[NodeField]:
         """Distance to the certain obstacles, one per contact rule."""
         return list(self._at.fields)

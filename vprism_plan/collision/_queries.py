@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from vprism_plan.collision._packing import require_prismatic_limits
 from vprism_plan.collision._path_risk import PathRisk
+from vprism_plan.collision._risk_setting import Setting
 from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.entropy import PathEntropy, path_entropy
 from vprism_plan.collision.margin_reports import SafetyMargins
@@ -111,6 +112,10 @@ class Queries:
                     self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
                 )
             return self._path_risk
+
+    def risk_setting(self) -> Setting:
+        """Return what probabilities are counted with, for planners' objectives."""
+        return self._risk().setting
 
     def risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
         """Return what makes a configuration too risky; empty if it is not, or has no bound."""

@@ -13,31 +13,99 @@ from vprism_plan.errors import PlanningError
 
 @dataclass(frozen=True)
 class PlannerKind:
-    """One OMPL planner: its class and what it needs.
+    """One OMPL planner: its class, what it needs and what it honours.
 
     Attributes:
         make: the OMPL class.
         optimising: whether it keeps improving its path until it is told to stop.
+        honours_objective: whether it minimises what it is given; the others minimise length,
+            or nothing.
         obeys_threshold: whether it stops at a path that satisfies the objective.
+        reports_cost: whether it says, while it searches, what its best path costs.
+        resumes: whether it goes on where it stopped when it is asked to solve once more.
+        goal_bias: whether it asks its goal for samples all along (and so can be guided).
+        informed: whether it samples only where a path could be better than its best; with
+            length on spaces without continuous joints directly, otherwise by rejection.
         has_range: whether the length of its steps can be set.
         needs_projection: whether it needs a projection of the state space.
+        starts_thread: whether it searches for solutions in a second thread. That thread
+            deadlocks as soon as it needs Python: for an objective, a goal region, a further
+            goal state or a termination condition.
+        note: what else one should know.
     """
 
     make: Callable[[Any], Any]
     optimising: bool = False
+    honours_objective: bool = False
     obeys_threshold: bool = True
+    reports_cost: bool = False
+    resumes: bool = False
+    goal_bias: bool = False
+    informed: bool = False
     has_range: bool = True
     needs_projection: bool = False
+    starts_thread: bool = False
+    note: str = ""
 
+
+def _star(make: Any, informed: bool) -> PlannerKind:
+    return PlannerKind(
+        make,
+        optimising=True,
+        honours_objective=True,
+        reports_cost=True,
+        resumes=True,
+        goal_bias=True,
+        informed=informed,
+    )
+
+
+def _piece(make: Any, note: str) -> PlannerKind:
+    return PlannerKind(make, needs_projection=True, note=note)
+
+
+_KEEPS_NOTHING = "keeps nothing of a motion that is blocked halfway (see `last_valid`)"
+_ONE_BATCH = "draws its samples once: one path, or none, whatever time is left"
+_ROADMAP = "one goal configuration, wall clock, length only: anything else would deadlock"
 
 PLANNERS: dict[str, PlannerKind] = {
-    "RRTConnect": PlannerKind(og.RRTConnect),
-    "RRTstar": PlannerKind(og.RRTstar, optimising=True),
-    "InformedRRTstar": PlannerKind(og.InformedRRTstar, optimising=True),
-    "BITstar": PlannerKind(og.BITstar, optimising=True, has_range=False),
-    "KPIECE1": PlannerKind(og.KPIECE1, needs_projection=True),
-    "AORRTC": PlannerKind(og.AORRTC, optimising=True, obeys_threshold=False),
+    "RRTConnect": PlannerKind(og.RRTConnect, note="grows two trees, usually the quickest"),
+    "RRT": PlannerKind(og.RRT, note="grows one tree"),
+    "RRTstar": _star(og.RRTstar, informed=False),
+    "InformedRRTstar": _star(og.InformedRRTstar, informed=True),
+    "SORRTstar": _star(og.SORRTstar, informed=True),
+    "BITstar": PlannerKind(
+        og.BITstar,
+        optimising=True,
+        honours_objective=True,
+        reports_cost=True,
+        resumes=True,
+        informed=True,
+        has_range=False,
+    ),
+    "AORRTC": PlannerKind(
+        og.AORRTC,
+        optimising=True,
+        obeys_threshold=False,
+        reports_cost=True,
+        informed=True,
+        note="reads the length of its paths, never an objective",
+    ),
+    "FMT": PlannerKind(og.FMT, honours_objective=True, has_range=False, note=_ONE_BATCH),
+    "BFMT": PlannerKind(og.BFMT, honours_objective=True, has_range=False, note=_ONE_BATCH),
+    "PRM": PlannerKind(og.PRM, has_range=False, starts_thread=True, note=_ROADMAP),
+    "PRMstar": PlannerKind(
+        og.PRMstar, optimising=True, has_range=False, starts_thread=True, note=_ROADMAP
+    ),
+    "KPIECE1": _piece(og.KPIECE1, _KEEPS_NOTHING),
+    "BKPIECE1": _piece(og.BKPIECE1, _KEEPS_NOTHING),
+    "LBKPIECE1": _piece(og.LBKPIECE1, _KEEPS_NOTHING),
 }
+
+
+def planners() -> dict[str, PlannerKind]:
+    """Return the planners that `plan` accepts, by name, with what each honours."""
+    return dict(PLANNERS)
 
 
 def planner_kind(name: str) -> PlannerKind:
@@ -110,6 +178,7 @@ class CostConvergence:
 
         A patience of 0 stops at the first solution.
         """
+        self.done = False
         self._best_cost = planner.bestCost
         self._tolerance = tolerance
         self._patience = patience
@@ -123,8 +192,37 @@ class CostConvergence:
         if cost < self._reference * (1.0 - self._tolerance):
             self._reference, self._reference_call = cost, self._calls
         found = self._reference < float("inf")
-        return found and self._calls - self._reference_call >= self._patience
+        self.done = found and self._calls - self._reference_call >= self._patience
+        return self.done
 
     def release(self) -> None:
         """Let go of the planner: AORRTC keeps its termination condition, a cycle."""
+        del self._best_cost
+
+
+class Improvements:
+    """A termination condition: stop when the best cost has become noticeably better.
+
+    Between two calls of `solve` the best path can be read; while it runs, it cannot. Costs
+    decide, not clocks, so the same seed stops at the same iterations.
+    """
+
+    def __init__(self, planner: Any, least: float) -> None:
+        """Stop at the first solution, then whenever the cost falls by the fraction `least`."""
+        self._best_cost = planner.bestCost
+        self._least = least
+        self._reference = float("inf")
+
+    def __call__(self) -> bool:
+        cost = self._best_cost().value()
+        if not cost < float("inf"):
+            return False
+        first = self._reference == float("inf")
+        if not first and not cost < self._reference * (1.0 - self._least):
+            return False
+        self._reference = cost
+        return True
+
+    def release(self) -> None:
+        """Let go of the planner."""
         del self._best_cost

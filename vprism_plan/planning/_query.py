@@ -29,8 +29,15 @@ def search_request(
     clock: str,
 ) -> SearchRequest:
     """Check the parameters of the search; raise PlanningError naming the first bad one."""
-    planner_kind(planner)
+    kind = planner_kind(planner)
     clock_named(clock)
+    if kind.starts_thread and clock != "wall":
+        raise PlanningError(
+            f"clock is {clock!r} with {planner}: its second thread would wait for ever for a "
+            "termination condition that is Python; use clock='wall'"
+        )
+    if stop == "converged" and kind.optimising and not kind.reports_cost:
+        raise PlanningError(f"{planner} does not say what its path costs; use stop='limit'")
     if not (math.isfinite(time_limit) and time_limit > 0):
         raise PlanningError(f"time_limit is {time_limit!r} s; it must be finite and more than 0")
     if stop not in ("limit", "first", "converged"):
@@ -129,3 +136,16 @@ def valid_goals(
         message=f"all {found.reached} configurations found for the goal pose are invalid, "
         f"the first: {refusal.message.removeprefix('goal is invalid: ')}",
     )
+
+
+def refuse_deadlock(planner: str, goals: Float[np.ndarray, "g dof"]) -> None:
+    """Raise PlanningError if a planner would wait for ever for a lock with these goals.
+
+    A second thread of PRM and PRMstar asks whether further goals are valid. The checker is
+    Python, whose lock the first thread holds.
+    """
+    if planner_kind(planner).starts_thread and len(goals) > 1:
+        raise PlanningError(
+            f"{planner} deadlocks with more than one goal configuration, here {len(goals)}; give "
+            "one, or use RRTConnect, or another of `planners()` that starts no thread"
+        )

@@ -150,18 +150,22 @@ def to_state(space: Any, q: Float[np.ndarray, " dof"]) -> Any:
 
     Raises PlanningError if q does not have one finite number per coordinate.
     """
-    wraps = wrapping_coordinates(space)
+    dof = len(wrapping_coordinates(space))
     values = np.array(q, dtype=np.float64)
-    if values.shape != (len(wraps),) or not np.isfinite(values).all():
-        raise PlanningError(
-            f"configuration {q!r} must be {len(wraps)} finite numbers, one per coordinate"
-        )
-    turned = np.mod(values + np.pi, 2.0 * np.pi) - np.pi
-    # Angles that are already in range stay bit-identical.
-    wrap = np.array(wraps) & ((values < -np.pi) | (values >= np.pi))
+    if values.shape != (dof,) or not np.isfinite(values).all():
+        raise PlanningError(f"configuration {q!r} must be {dof} finite numbers, one per coordinate")
     state = space.allocState()
-    _write(space, np.where(wrap, turned, values).tolist(), 0, state)
+    write_state(space, values, state)
     return state
+
+
+def write_state(space: Any, q: Float[np.ndarray, " dof"], state: Any) -> None:
+    """Write coordinates q (flat order) to a state, SO2 parts wrapped; no checks of q."""
+    wraps = np.array(wrapping_coordinates(space))
+    turned = np.mod(q + np.pi, 2.0 * np.pi) - np.pi
+    # Angles that are already in range stay bit-identical.
+    wrap = wraps & ((q < -np.pi) | (q >= np.pi))
+    _write(space, np.where(wrap, turned, q).tolist(), 0, state)
 
 
 class _Buffers(threading.local):

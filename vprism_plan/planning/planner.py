@@ -3,6 +3,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,19 +12,28 @@ from numpy.typing import ArrayLike
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._clock import Now, clock_named
+from vprism_plan.planning._planners import planner_kind, planners
 from vprism_plan.planning._protocol import CheckerLike, SecondOpinion
-from vprism_plan.planning._query import configuration, refuse, search_request, valid_goals
+from vprism_plan.planning._query import (
+    configuration,
+    refuse,
+    refuse_deadlock,
+    search_request,
+    valid_goals,
+)
 from vprism_plan.planning._risk import with_allowed_contacts, within_risk
 from vprism_plan.planning._runtime import MAX_SEED
-from vprism_plan.planning._search import SearchRequest, search
+from vprism_plan.planning._search import SearchOutcome, SearchRequest, search
 from vprism_plan.planning._second_opinion import refuse_unfit, reviewed
-from vprism_plan.planning._shortcut import shorten
+from vprism_plan.planning._shortcut import cheapen, shorten
 from vprism_plan.planning._verify import MotionCheck, resample, split_turns, verified
 from vprism_plan.planning.goals import PoseGoalConfig
+from vprism_plan.planning.objectives import PathCost, RiskObjective
 from vprism_plan.planning.ompl_adapter import check_straight, shortest_step
-from vprism_plan.planning.result import PlanReport, PlanResult
+from vprism_plan.planning.result import Improvement, PlanReport, PlanResult
 
 _ATTEMPTS = 5
+_LEAD_SHARE = 0.1  # of the time limit that shortening a leading path may take
 _SEED_STRIDE = 0x9E3779B1
 
 
@@ -45,6 +55,8 @@ def plan(
     pose_goal: PoseGoalConfig | None = None,
     second_opinion: SecondOpinion | None = None,
     clock: str = "wall",
+    objective: str | RiskObjective = "length",
+    warm_start: bool = True,
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
@@ -60,16 +72,17 @@ def plan(
         start: start configuration (dof,), radians or metres.
         goal: goal configuration (dof,), or the pose (4, 4) of the end effector in the
             world frame (see `pose_goal`).
-        planner: RRTConnect, RRTstar, InformedRRTstar, BITstar, KPIECE1 or AORRTC.
+        planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
+            BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
         time_limit: time for the search in seconds, more than 0; on `clock`.
         seed: an integer from 0. The same seed gives the same path as long as the search
             ends by itself before the limit. OMPL's generator is global: this seeds it.
-        stop: when the optimising planners (RRTstar, InformedRRTstar, BITstar, AORRTC)
-            stop: "limit", at the time limit (their path then depends on the machine's
-            speed); "first", at the first solution; "converged", when the path length
+        stop: when the optimising planners (RRTstar, InformedRRTstar, SORRTstar, BITstar,
+            AORRTC, PRMstar) stop: "limit", at the time limit (their path then depends on the
+            machine's speed); "first", at the first solution; "converged", when the cost
             has settled. The others stop at their first solution in any case.
         convergence: for stop="converged": (tolerance, patience), stop when `patience`
-            iterations have shortened the path by less than the fraction `tolerance`.
+            iterations have lowered the cost by less than the fraction `tolerance`.
         simplify: whether to shorten the path after the search.
         simplify_time: seconds after which no further round of shortening starts.
         step: length of the planner's steps in the metric of the space; OMPL's choice
@@ -84,6 +97,13 @@ def plan(
         clock: what limits, and all times of the report, are measured by: "wall", or
             "process", the processor time of this process, which makes measurements on a
             busy machine comparable (a search that waits for nothing takes the same).
+        objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
+            objective are accepted; shortening then never raises the cost, and afterwards
+            waypoints are moved, within `simplify_time`, where that lowers it. A straight
+            motion to the goal is taken at once only if it runs no risk.
+        warm_start: with a risk, whether RRTstar, InformedRRTstar and SORRTstar are given the
+            path of a quick RRTConnect to begin with, out of the time limit, and draw half of
+            their samples around the best path so far.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -110,20 +130,70 @@ def plan(
     goals = valid_goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
     if isinstance(goals, PlanResult):
         return goals
+    refuse_deadlock(planner, goals)
     report = replace(report, state_checks=1 + len(goals), motion_checks=len(goals))
-    finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step, now)
+    cost, prepared = _prepared(checker, objective, planner, now)
+    report = replace(report, **prepared)
+    finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step, now, cost)
 
     def attempt(judge: CheckerLike, limit: float, number: int) -> PlanResult:
         direct = _direct(judge, q_start, goals)
-        if direct is not None:
+        if direct is not None and (cost is None or _riskless(cost, direct[1])):
             path = finish.resampled(judge, direct[1])
             found = replace(report, direct=True, goal_index=direct[0])
             return verified(judge, path, clearance_step, found, now)
         other = replace(request, time_limit=limit, seed=_other_seed(request.seed, 64 * number))
-        return _searched(judge, q_start, goals, other, finish, report)
+        lead = None if direct is None else direct[1]
+        warm = warm_start and cost is not None and stop != "first"
+        begin = _Begin(warm and planner_kind(planner).goal_bias, lead)
+        return _searched(judge, q_start, goals, other, finish, report, begin)
 
     result = within_risk(checker, attempt, request.time_limit, now)
+    if result.path is not None:
+        found = result.report.path_length if cost is None else cost.path(result.path)
+        result = replace(result, report=replace(result.report, cost=found))
     return reviewed(with_allowed_contacts(result, checker), checker, second_opinion, now)
+
+
+def _prepared(
+    checker: CheckerLike, objective: str | RiskObjective, planner: str, now: Now
+) -> tuple[PathCost | None, dict[str, Any]]:
+    """Return what paths cost, None for length, and what to report of it."""
+    if objective == "length":
+        return None, {}
+    if not isinstance(objective, RiskObjective):
+        raise PlanningError(
+            f"objective is {objective!r}; it must be 'length' or a RiskObjective, for example "
+            "RiskObjective(kind='joint')"
+        )
+    kind = planner_kind(planner)
+    if not kind.honours_objective:
+        able = ", ".join(name for name, k in planners().items() if k.honours_objective)
+        raise PlanningError(
+            f"{planner} does not honour an objective{': it ' if kind.note else ''}{kind.note}; "
+            f"planners that do are {able}"
+        )
+    began = now()
+    cost = objective.cost(checker)
+    name = f"worst {objective.kind}" if objective.worst else objective.kind
+    return cost, {"objective": name, "objective_time": now() - began}
+
+
+def _riskless(cost: PathCost, path: Float[np.ndarray, "t dof"]) -> bool:
+    return all(cost.risk.motion(a, b) == 0.0 for a, b in pairwise(path))
+
+
+@dataclass(frozen=True)
+class _Begin:
+    """Where a search begins.
+
+    Attributes:
+        warm: whether the planner is to be led along a path that is known.
+        lead: such a path, or None: then it has to be searched for.
+    """
+
+    warm: bool
+    lead: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -135,6 +205,7 @@ class _Finish:
     interpolate: float | None
     clearance_step: float
     now: Now
+    cost: PathCost | None
 
     def shortened(
         self, checker: CheckerLike, path: Float[np.ndarray, "t dof"], report: PlanReport
@@ -144,7 +215,11 @@ class _Finish:
             return path, report
         began = self.now()
         check = MotionCheck(checker)
-        path = shorten(path, check, report.seed, began + self.simplify_time, self.now)
+        end = began + self.simplify_time
+        path = shorten(path, check, report.seed, end, self.now, self.cost)
+        if self.cost is not None:
+            path = cheapen(path, check, report.seed, end, self.now, self.cost)
+            path = shorten(path, check, report.seed, end, self.now, self.cost)
         return path, replace(
             report,
             simplification_time=report.simplification_time + self.now() - began,
@@ -168,6 +243,7 @@ def _searched(
     request: SearchRequest,
     finish: _Finish,
     report: PlanReport,
+    begin: _Begin,
 ) -> PlanResult:
     """Search, shorten and verify; search again with another seed if verification fails.
 
@@ -180,13 +256,15 @@ def _searched(
         if left <= 0.0:
             break
         seed = _other_seed(request.seed, attempt)
-        found = search(checker, start, goals, replace(request, seed=seed, time_limit=left))
+        query = replace(request, seed=seed, time_limit=left)
+        found = _led(checker, start, goals, query, finish, begin)
         report = replace(
             report,
             searches=attempt + 1,
             planning_time=report.planning_time + found.planning_time,
             state_checks=report.state_checks + found.state_checks,
             motion_checks=report.motion_checks + found.motion_checks,
+            history=found.history,
         )
         if found.status != "exact" or found.path is None:
             return refused or _not_found(found.status, found.path, report)
@@ -203,6 +281,67 @@ def _searched(
     if refused is None:
         raise PlanningError(f"time_limit {request.time_limit} s left no time for a search")
     return refused
+
+
+def _led(
+    checker: CheckerLike,
+    start: Float[np.ndarray, " dof"],
+    goals: Float[np.ndarray, "g dof"],
+    request: SearchRequest,
+    finish: _Finish,
+    begin: _Begin,
+) -> SearchOutcome:
+    """Search, led along a known path if that is wanted: given, or RRTConnect's."""
+    if not begin.warm:
+        return search(checker, start, goals, request, finish.cost)
+    lead, spent = begin.lead, 0.0
+    quick: SearchOutcome | None = None
+    if lead is None:
+        quick = search(
+            checker, start, goals, replace(request, planner="RRTConnect", stop="first", step=None)
+        )
+        if quick.status != "exact" or quick.path is None:
+            return quick
+        began = finish.now()
+        end = began + _LEAD_SHARE * request.time_limit
+        lead = shorten(quick.path, MotionCheck(checker), request.seed, end, finish.now)
+        spent = quick.planning_time + finish.now() - began
+    left = request.time_limit - spent
+    if left <= 0.0 and quick is not None:
+        return quick
+    found = search(checker, start, goals, replace(request, time_limit=left), finish.cost, lead)
+    return _better(found, lead, finish, spent, quick, goals)
+
+
+def _better(
+    found: SearchOutcome,
+    lead: Float[np.ndarray, "t dof"],
+    finish: _Finish,
+    spent: float,
+    quick: SearchOutcome | None,
+    goals: Float[np.ndarray, "g dof"],
+) -> SearchOutcome:
+    """Return the cheaper of what was found and what led there, with the effort of both."""
+    assert finish.cost is not None
+    whole = replace(
+        found,
+        planning_time=spent + found.planning_time,
+        state_checks=found.state_checks + (quick.state_checks if quick else 0),
+        motion_checks=found.motion_checks + (quick.motion_checks if quick else 0),
+        history=(
+            Improvement(spent, finish.cost.path(lead), lead),
+            *(replace(better, time=spent + better.time) for better in found.history),
+        ),
+    )
+    cheaper = (
+        found.status == "exact"
+        and found.path is not None
+        and finish.cost.path(found.path) <= finish.cost.path(lead)
+    )
+    if cheaper:
+        return whole
+    index = quick.goal_index if quick else int(np.argmin(np.abs(goals - lead[-1]).max(axis=1)))
+    return replace(whole, status="exact", path=lead, goal_index=index)
 
 
 def _other_seed(seed: int, number: int) -> int:

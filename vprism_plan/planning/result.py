@@ -18,6 +18,22 @@ Status = Literal[
 
 
 @dataclass(frozen=True)
+class Improvement:
+    """The best path at some time of a search.
+
+    Attributes:
+        time: seconds since the search began, on the query's clock.
+        cost: by the objective; the planner's own value.
+        path: (T, dof) radians and metres, as the planner found it: each motion passed the
+            check of the search, none was shortened or verified again.
+    """
+
+    time: float
+    cost: float
+    path: np.ndarray
+
+
+@dataclass(frozen=True)
 class PlanReport:
     """The numbers behind a `PlanResult`.
 
@@ -61,6 +77,12 @@ class PlanReport:
         allowed_contacts: contacts that the rules permit, at the last waypoint: what the
             robot ends touching (`Contact`s).
         clock: what all these seconds were measured by: "wall" or "process" (processor time).
+        objective: what the search made small: "length", or the kind of risk.
+        objective_time: seconds that preparing it took: worlds drawn and baked, the first time.
+        cost: of the path by that objective (`path_length` for "length"); NaN without a path.
+        history: the best path each time it had become noticeably better, the last one as it
+            was before it was shortened; only of planners that report their cost and resume
+            (see `planners`).
     """
 
     planner: str
@@ -88,6 +110,10 @@ class PlanReport:
     risk_time: float = 0.0
     allowed_contacts: tuple[Any, ...] = ()
     clock: str = "wall"
+    objective: str = "length"
+    objective_time: float = 0.0
+    cost: float = float("nan")
+    history: tuple[Improvement, ...] = ()
 
 
 @dataclass(frozen=True)

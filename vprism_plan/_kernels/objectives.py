@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Compiled loops behind planners' objectives: what a robot risks along a straight motion.
+
+Quicker and coarser than the kernels that verdicts rest on (`risk`), and never milder: an
+objective is asked about hundreds of motions where a checker is asked about one. Most of a
+motion is far from anything uncertain and is passed over in strides.
+
+The robot (`rf`, `ri`) is packed as in `vprism_plan._kernels.checking`, the draws' tables are
+those of `vprism_plan._kernels.risk`. Kernels must not import each other (a cached one would
+not notice that the other changed), so the few lines of kinematics are here once more.
+"""
+
+import numpy as np
+from numba import njit
+
+UNBAKED = np.int32(-1)  # as in `risk`
+DRAWS, MEANS, PEAKS = 0, 1, 2
+_MAX_TURN = 0.5  # radians per step, as in `checking`
+
+
+@njit(cache=True, nogil=True)
+def _frames(q, rf, ri, T):
+    """Fill T (n_frames, 12) with the world pose of every frame: R row-major, then t."""
+    fi = ri[8]
+    for k in range(12):
+        T[0, k] = rf[ri[16] + k]
+    for i in range(1, ri[0]):
+        p = ri[fi + 3 * i]
+        kind = ri[fi + 3 * i + 1]
+        o = ri[16] + 14 * i
+        value = rf[o + 12] * q[ri[fi + 3 * i + 2]] + rf[o + 13]
+        s = np.sin(value) if kind == 1 else 0.0
+        c = np.cos(value) if kind == 1 else 1.0
+        for r in range(3):
+            a = T[p, 3 * r]
+            b = T[p, 3 * r + 1]
+            d = T[p, 3 * r + 2]
+            x = a * rf[o] + b * rf[o + 3] + d * rf[o + 6]
+            y = a * rf[o + 1] + b * rf[o + 4] + d * rf[o + 7]
+            z = a * rf[o + 2] + b * rf[o + 5] + d * rf[o + 8]
+            T[i, 3 * r] = c * x + s * y
+            T[i, 3 * r + 1] = c * y - s * x
+            T[i, 3 * r + 2] = z
+            t = T[p, 9 + r] + a * rf[o + 9] + b * rf[o + 10] + d * rf[o + 11]
+            T[i, 9 + r] = t + z * value if kind == 2 else t
+
+
+@njit(cache=True, nogil=True)
+def plan_steps(qa, qb, rf, ri, spacing, delta, link_rate):
+    """Fill delta (dof,), continuous joints the short way round, and link_rate (n_links,), a
+    bound on the way of any sphere centre of a link along the motion, metres.
+
+    Returns the number of steps, so that in one no centre moves more than `spacing` and the
+    joints turn by at most half a radian together; the largest of the rates; the whole turn.
+    """
+    for j in range(ri[4]):
+        d = qb[j] - qa[j]
+        if ri[ri[11] + j] != 0:
+            d -= 2.0 * np.pi * np.round(d / (2.0 * np.pi))
+        delta[j] = d
+    turned = 0.0
+    link_rate[:] = 0.0
+    n_links = ri[2]
+    for f in range(1, ri[0]):
+        speed = abs(rf[ri[16] + 14 * f + 12] * delta[ri[ri[8] + 3 * f + 2]])
+        if ri[ri[8] + 3 * f + 1] == 1:
+            turned += speed
+        for link in range(n_links):
+            link_rate[link] += speed * max(rf[ri[20] + f * n_links + link], 0.0)
+    farthest = 0.0
+    for link in range(n_links):
+        farthest = max(farthest, link_rate[link])
+    steps = max(int(np.ceil(farthest / spacing)), int(np.ceil(turned / _MAX_TURN)))
+    return steps, farthest, turned
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _away(gx, gy, gz, possible, corner):
+    """Lower bound of the distance from a point to anything uncertain, voxels.
+
+    possible (x, y, z): distances at voxel centres from index `corner` on. Everything
+    uncertain lies inside that box, so a point outside is at least as far as its projection.
+    """
+    gx = min(max(gx - corner[0], 0.0), possible.shape[0] - 1.0)
+    gy = min(max(gy - corner[1], 0.0), possible.shape[1] - 1.0)
+    gz = min(max(gz - corner[2], 0.0), possible.shape[2] - 1.0)
+    x = int(gx + 0.5)
+    y = int(gy + 0.5)
+    z = int(gz + 0.5)
+    off = np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+    return possible[x, y, z] - off
+
+
+@njit(cache=True, nogil=True)
+def _bound_ball(gx, gy, gz, need, distance_row, table, rows, lowest, scale, reach, hit):
+    """Add to hit (S,) the draws that may occupy a voxel centre within `need` of g (voxels of
+    the table): 1 some may, 0 none, -1 a voxel is unbaked.
+
+    Every node v of the cell around g must allow it: some occupied centre within
+    need + |g - v| of v. What one node rules out is free; so no draw is missed.
+    """
+    _, ex, ey, ez = distance_row.shape
+    if not (0.0 <= gx <= ex - 1.0 and 0.0 <= gy <= ey - 1.0 and 0.0 <= gz <= ez - 1.0):
+        return 0
+    x0 = min(int(gx), ex - 2)
+    y0 = min(int(gy), ey - 2)
+    z0 = min(int(gz), ez - 2)
+    found = np.empty(8, np.int64)
+    limits = np.empty(8, np.uint8)
+    n = 0
+    for corner in range(8):
+        x = x0 + (corner >> 2)
+        y = y0 + ((corner >> 1) & 1)
+        z = z0 + (corner & 1)
+        row = distance_row[table, x, y, z]
+        if row < 0:
+            return -1 if row == UNBAKED else 0
+        away = need + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+        if away < reach:  # the table knows no farther: never "free" for that
+            limit = np.uint8(away * scale)
+            if lowest[row] > limit:
+                return 0
+            found[n] = row
+            limits[n] = limit
+            n += 1
+    if n == 8:
+        a, b, c, d = rows[found[0]], rows[found[1]], rows[found[2]], rows[found[3]]
+        e, f, g, h = rows[found[4]], rows[found[5]], rows[found[6]], rows[found[7]]
+        for s in range(hit.size):
+            hit[s] |= np.uint8(
+                (a[s] <= limits[0]) & (b[s] <= limits[1]) & (c[s] <= limits[2])
+                & (d[s] <= limits[3]) & (e[s] <= limits[4]) & (f[s] <= limits[5])
+                & (g[s] <= limits[6]) & (h[s] <= limits[7])
+            )  # fmt: skip
+    else:
+        for s in range(hit.size):
+            inside = True
+            for k in range(n):
+                inside &= rows[found[k], s] <= limits[k]
+            hit[s] |= np.uint8(inside)
+    return 1
+
+
+@njit(cache=True, nogil=True)
+def _mark(gx, gy, gz, wide, table, wanted):
+    """Mark the blocks of 16^3 voxels that a box around g reaches."""
+    _, bx, by, bz = wanted.shape
+    for i in range(max(int(gx - wide) // 16, 0), min(int(gx + wide) // 16 + 1, bx)):
+        for j in range(max(int(gy - wide) // 16, 0), min(int(gy + wide) // 16 + 1, by)):
+            for k in range(max(int(gz - wide) // 16, 0), min(int(gz + wide) // 16 + 1, bz)):
+                wanted[table, i, j, k] = True
+
+
+@njit(cache=True, nogil=True)
+def _read_field(gx, gy, gz, ball, field, corner, directions, peak):
+    """Mean, or largest, value of a field at some points of a ball (voxels), 0 outside it."""
+    nx, ny, nz = field.shape
+    result = 0.0
+    for d in range(directions.shape[0]):
+        x = int(np.floor(gx - corner[0] + ball * directions[d, 0] + 0.5))
+        y = int(np.floor(gy - corner[1] + ball * directions[d, 1] + 0.5))
+        z = int(np.floor(gz - corner[2] + ball * directions[d, 2] + 0.5))
+        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz:
+            value = field[x, y, z]
+            result = max(result, value) if peak else result + value
+    return result if peak else result / directions.shape[0]
+
+
+@njit(cache=True, nogil=True)
+def sweep_draws(
+    qa, delta, steps, link_rate, turned, rf, ri, radii, tables, possible, corner, spacing,
+    distance_row, rows, lowest, first, scale, reach, counts, touched, wanted,
+):  # fmt: skip
+    """Upper bounds of the draws that a straight motion touches: counts (steps + 1,) at each
+    sample, touched (S,) anywhere on it. Returns how many balls met an unbaked voxel.
+
+    radii (m,) metres; tables (m,) the table of each sphere, -1 = not checked; possible,
+    corner: see `_away`; spacing: edge of a voxel, metres. Spheres grow by what covers the
+    way to the neighbouring samples, as in `checking.place_path`. wanted: the blocks to bake;
+    the rest means nothing where something is missing.
+    """
+    n_draws = rows.shape[1]
+    T = np.empty((ri[0], 12))
+    q = np.empty(ri[4])
+    here = np.empty(n_draws, np.uint8)
+    touched[:] = 0
+    counts[:] = 0
+    missing = 0
+    ns = ri[1]
+    parts = max(steps, 1)
+    k = 0
+    while k <= steps:
+        for j in range(ri[4]):
+            q[j] = qa[j] + (k / parts) * delta[j]
+        _frames(q, rf, ri, T)
+        here[:] = 0
+        stride = parts + 1.0
+        for link in range(ri[2]):
+            li = ri[9] + 4 * link
+            begin = ri[li + 1]
+            end = ri[li + 2]
+            if begin == end or tables[begin] < 0:
+                continue
+            step = link_rate[link] / parts
+            bend = 0.25 * (turned / parts) * step
+            f = ri[li]
+            bo = ri[18] + 4 * link
+            # The bounding sphere first, then sphere by sphere.
+            bx, by, bz, clear = rf[bo], rf[bo + 1], rf[bo + 2], 0.0
+            gx = (T[f, 0] * bx + T[f, 1] * by + T[f, 2] * bz + T[f, 9]) / spacing
+            gy = (T[f, 3] * bx + T[f, 4] * by + T[f, 5] * bz + T[f, 10]) / spacing
+            gz = (T[f, 6] * bx + T[f, 7] * by + T[f, 8] * bz + T[f, 11]) / spacing
+            grown = bend + 0.5 * step
+            clear = _away(gx, gy, gz, possible, corner) - (rf[bo + 3] + grown) / spacing - 0.5
+            if clear <= 2.0:
+                clear = 1e9
+                for s in range(begin, end):
+                    x, y, z = rf[ri[17] + s], rf[ri[17] + ns + s], rf[ri[17] + 2 * ns + s]
+                    gx = (T[f, 0] * x + T[f, 1] * y + T[f, 2] * z + T[f, 9]) / spacing
+                    gy = (T[f, 3] * x + T[f, 4] * y + T[f, 5] * z + T[f, 10]) / spacing
+                    gz = (T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]) / spacing
+                    r = radii[s]
+                    need = (np.sqrt(r * r + 0.25 * step * step) + bend) / spacing + 0.5
+                    free = _away(gx, gy, gz, possible, corner) - need
+                    clear = min(clear, free)
+                    if free > 0.0:
+                        continue
+                    found = _bound_ball(
+                        gx - first[0], gy - first[1], gz - first[2], need, distance_row,
+                        tables[s], rows, lowest, scale, reach, here,
+                    )  # fmt: skip
+                    if found < 0:
+                        missing += 1
+                        _mark(
+                            gx - first[0], gy - first[1], gz - first[2], need + 2.0, tables[s],
+                            wanted,
+                        )  # fmt: skip
+            if clear <= 0.0:
+                stride = 0.0
+            elif clear * spacing < stride * step:
+                stride = clear * spacing / step
+        if stride < 1.0:
+            total = 0
+            for s in range(n_draws):
+                total += here[s]
+                touched[s] |= here[s]
+            counts[k] = total
+        k += max(int(stride), 1)
+    return missing
+
+
+@njit(cache=True, nogil=True)
+def sweep_field(
+    qa, delta, steps, link_rate, rf, ri, radii, weights, possible, corner, spacing,
+    field, field_corner, directions, peak, values,
+):  # fmt: skip
+    """Fill values (steps + 1,): at each sample of a straight motion the weighted sum, over the
+    spheres, of a field's mean (or peak) in the sphere.
+
+    weights (m,), 0 = left out; field (nx, ny, nz) at voxel centres from index field_corner
+    on; directions (d, 3) points of the unit ball. The rest as in `sweep_draws`.
+    """
+    T = np.empty((ri[0], 12))
+    q = np.empty(ri[4])
+    values[:] = 0.0
+    ns = ri[1]
+    parts = max(steps, 1)
+    k = 0
+    while k <= steps:
+        for j in range(ri[4]):
+            q[j] = qa[j] + (k / parts) * delta[j]
+        _frames(q, rf, ri, T)
+        total = 0.0
+        stride = parts + 1.0
+        for link in range(ri[2]):
+            li = ri[9] + 4 * link
+            begin = ri[li + 1]
+            end = ri[li + 2]
+            if begin == end or weights[begin] == 0.0:
+                continue
+            f = ri[li]
+            clear = 1e9
+            for s in range(begin, end):
+                x, y, z = rf[ri[17] + s], rf[ri[17] + ns + s], rf[ri[17] + 2 * ns + s]
+                gx = (T[f, 0] * x + T[f, 1] * y + T[f, 2] * z + T[f, 9]) / spacing
+                gy = (T[f, 3] * x + T[f, 4] * y + T[f, 5] * z + T[f, 10]) / spacing
+                gz = (T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]) / spacing
+                ball = radii[s] / spacing
+                free = _away(gx, gy, gz, possible, corner) - ball - 0.87
+                clear = min(clear, free)
+                if free <= 0.0:
+                    total += weights[s] * _read_field(
+                        gx, gy, gz, ball, field, field_corner, directions, peak
+                    )
+            step = link_rate[link] / parts
+            if clear <= 0.0:
+                stride = 0.0
+            elif clear * spacing < stride * step:
+                stride = clear * spacing / step
+        values[k] = total
+        k += max(int(stride), 1)

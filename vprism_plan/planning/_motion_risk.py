@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a straight motion risks, as a number that planners can add up."""
+
+import math
+from itertools import product
+from typing import Any, Literal
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan._kernels import objectives as kernels
+from vprism_plan.errors import PlanningError
+
+Kind = Literal["survival", "joint", "occupancy", "entropy"]
+KINDS: tuple[str, ...] = ("survival", "joint", "occupancy", "entropy")
+
+_PAD = 0.25  # metres around what is uncertain in which distances to it are known
+_LEAST = 1e-3  # probability, or nats, below which a field counts as 0
+_MOST_KEPT = 200_000  # motions whose cost is remembered
+
+
+# The middle of a ball, and its surface towards the faces and the corners of a cube.
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3.0)
+_POINTS = np.concatenate([np.zeros((1, 3)), _AXES, _CORNERS])
+
+
+class MotionRisk:
+    """The risk of motions and configurations of one checker's robot, by one of the kinds.
+
+    Motions are sampled so that no sphere centre moves more than `spacing` between samples;
+    stretches that are far from anything uncertain are skipped. All samples of a motion are
+    worked through in one compiled call, and its cost is remembered.
+
+    The rates of a configuration q:
+        survival: -log(1 - p(q)), p the share of the checker's posterior worlds in which the
+            robot touches anything; a bound from above of the marginal that
+            `checker.collision_probability(q)` gives.
+        occupancy: sum over the spheres of the largest P(occupied) found in each.
+        entropy: mean entropy, nats, of the map in the volume of the moving spheres. Only
+            where posterior worlds can differ; elsewhere the map is certain, or has no support.
+
+    The cost of a motion is the integral of the rate over the way of the sphere that moves
+    farthest (a bound on it, metres), by the trapezoidal rule. "joint" is not an integral but
+    -log(1 - p) with p the share of worlds in which the robot touches anything anywhere on
+    the motion, the same world for the whole motion; summed over a path's edges it bounds
+    -log(1 - risk) of the path if touching on one edge does not make touching on another
+    less likely.
+
+    Args:
+        checker: a `CollisionChecker` over a `World`.
+        kind: one of the above.
+        spacing: metres of sphere motion.
+
+    Raises:
+        PlanningError: an unknown kind, a spacing out of range, or no posterior.
+    """
+
+    def __init__(self, checker: Any, kind: str, spacing: float) -> None:
+        if kind not in KINDS:
+            raise PlanningError(f"kind is {kind!r}; valid kinds of risk are {', '.join(KINDS)}")
+        if not (math.isfinite(spacing) and 1e-3 <= spacing <= 0.5):
+            raise PlanningError(f"spacing is {spacing!r}; it must be 0.001 to 0.5 metres")
+        if not hasattr(checker, "risk_setting"):
+            raise PlanningError(
+                f"a {type(checker).__name__} has no posterior to take risks from; give a "
+                "CollisionChecker over a World, or a function as the kind of risk"
+            )
+        self.kind = kind
+        self.spacing = float(spacing)
+        self._at = checker.risk_setting()
+        worlds = self._at.worlds
+        self._possible, self._corner = _possible(worlds)
+        self._rates = np.empty(self._at.ints[2])
+        self._delta = np.empty(self._at.ints[4])
+        self._kept: dict[tuple[bytes, bytes], float] = {}
+        self._ceiling = 1.0 - 0.5 / worlds.n_worlds  # p = 1 must stay finite
+        self._touched = np.zeros(worlds.n_worlds, np.uint8)
+        if kind in ("occupancy", "entropy"):
+            self._field = _field(worlds, self._at.world, kind)
+            self._weights = _weights(self._at, kind)
+            self._directions = _POINTS if kind == "occupancy" else 0.8 * _POINTS
+        else:
+            # Whoever asks first would wait for the draws: inside a planner's time limit.
+            marks = worlds.new_marks()
+            marks[np.unique(self._at.sphere_tables[self._at.sphere_tables >= 0])] = True
+            worlds.bake_marked(marks)
+        self._marks = worlds.new_marks()
+
+    def motion(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+        """Return the cost of the straight motion between two configurations, either way."""
+        a, b = qa.tobytes(), qb.tobytes()
+        key = (a, b) if a <= b else (b, a)
+        cost = self._kept.get(key)
+        if cost is None:
+            if len(self._kept) >= _MOST_KEPT:
+                self._kept.clear()
+            # In one order, so that both directions cost the same to the last bit.
+            cost = self._cost(qa, qb) if a <= b else self._cost(qb, qa)
+            self._kept[key] = cost
+        return cost
+
+    def state(self, q: Float[np.ndarray, " dof"]) -> float:
+        """Return the rate at one configuration."""
+        rates, touched, _ = self._sweep(q, q)
+        if self.kind == "joint":
+            return self._survival(touched)
+        return float(self._as_rates(rates)[0])
+
+    def worst(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+        """Return the largest rate at the samples of the straight motion, either way."""
+        if self.kind == "joint":
+            return self.motion(qa, qb)
+        a, b = (qa, qb) if qa.tobytes() <= qb.tobytes() else (qb, qa)
+        rates, _, _ = self._sweep(a, b)
+        return float(self._as_rates(rates).max())
+
+    def _cost(self, qa: np.ndarray, qb: np.ndarray) -> float:
+        rates, touched, way = self._sweep(qa, qb)
+        if self.kind == "joint":
+            return self._survival(touched)
+        if len(rates) == 1 or not rates.any():
+            return 0.0
+        values = self._as_rates(rates)
+        mean = (values.sum() - 0.5 * (values[0] + values[-1])) / (len(values) - 1)
+        return float(way * mean)
+
+    def _as_rates(self, values: np.ndarray) -> np.ndarray:
+        if self.kind != "survival":
+            return values
+        p = np.minimum(values / len(self._touched), self._ceiling)
+        return -np.log1p(-p)
+
+    def _survival(self, touched: int) -> float:
+        return -math.log1p(-min(touched / len(self._touched), self._ceiling))
+
+    def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, int, float]:
+        """Values at the samples, worlds touched anywhere, bound on the way in metres."""
+        at, worlds = self._at, self._at.worlds
+        steps, way, turned = kernels.plan_steps(
+            qa, qb, at.floats, at.ints, self.spacing, self._delta, self._rates
+        )
+        if self.kind in ("occupancy", "entropy"):
+            values = np.empty(steps + 1)
+            kernels.sweep_field(
+                qa, self._delta, steps, self._rates, at.floats, at.ints, at.radii, self._weights,
+                self._possible, self._corner, worlds.resolution, self._field[0], self._field[1],
+                self._directions, self.kind == "occupancy", values,
+            )  # fmt: skip
+            return values, 0, way
+        counts = np.empty(steps + 1, np.int64)
+        scale, reach = worlds.scale
+        while True:
+            tables = worlds.tables
+            missing = kernels.sweep_draws(
+                qa, self._delta, steps, self._rates, turned, at.floats, at.ints, at.radii,
+                at.sphere_tables, self._possible, self._corner, worlds.resolution,
+                tables.distance_row, tables.rows, tables.lowest, worlds.first, scale, reach,
+                counts, self._touched, self._marks,
+            )  # fmt: skip
+            if not missing:
+                return counts, int(self._touched.sum()), way
+            worlds.bake_marked(self._marks)
+            self._marks = worlds.new_marks()
+
+
+# Baking takes longer than many a search, so objectives over one map share it.
+_baked: WeakKeyDictionary[Any, dict[str, tuple[np.ndarray, np.ndarray]]] = WeakKeyDictionary()
+
+
+def _possible(worlds: Any) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]:
+    """Distance, voxels, from voxel centres to the nearest that any draw may occupy; first index."""
+    kept = _baked.setdefault(worlds, {})
+    if "possible" not in kept:
+        from scipy import ndimage
+
+        row, _, first = worlds.owner_tables
+        filled = np.argwhere(row >= 0)
+        if len(filled) == 0:
+            kept["possible"] = np.full((1, 1, 1), 1e6, np.float32), np.zeros(3, np.int64)
+        else:
+            low, high = filled.min(axis=0), filled.max(axis=0) + 1
+            pad = math.ceil(_PAD / worlds.resolution)
+            inside = row[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] >= 0
+            away = ndimage.distance_transform_edt(~np.pad(inside, pad))
+            corner = np.asarray(first + low - pad, dtype=np.int64)
+            kept["possible"] = away.astype(np.float32), corner
+    return kept["possible"]
+
+
+def _field(
+    worlds: Any, world: Any, kind: str
+) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]:
+    """P(occupied), or entropy in nats, at the voxel centres of the posterior worlds."""
+    kept = _baked.setdefault(worlds, {})
+    if kind not in kept:
+        row, _, first = worlds.owner_tables
+        first = np.asarray(first, dtype=np.int64)
+        drawn = np.argwhere(row >= len(world.map.object_ids))
+        points = worlds.resolution * (drawn + first)
+        field = np.zeros(row.shape, np.float32)
+        if kind == "occupancy":
+            field[row >= 0] = 1.0
+            values = np.asarray(world.map.occupancy(points))
+        else:
+            values = np.asarray(world.map.entropy(points))
+            values[np.asarray(world.map.support(points)) < world.config.min_support] = 0.0
+        field[tuple(drawn.T)] = np.where(values < _LEAST, 0.0, values)
+        kept[kind] = field, first
+    return kept[kind]
+
+
+def _weights(at: Any, kind: str) -> Float[np.ndarray, " s"]:
+    """1 per sphere of the moving links, or its share of their volume."""
+    weights = (at.sphere_tables >= 0).astype(np.float64)
+    if kind == "entropy":
+        weights *= at.radii**3
+        weights /= max(float(weights.sum()), 1e-300)
+    return weights

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What an optimising planner should make small: risk, by OMPL's own interface.
+
+    problem.setOptimizationObjective(VPrismRiskObjective(si, checker, kind="joint"))
+
+Both classes derive from `ob.OptimizationObjective` and integrate motions themselves: in the
+bindings of OMPL 2.0.1 a Python `stateCost` of a `StateCostIntegralObjective` is never called.
+Neither keeps `si`, which would close a reference cycle through the binding.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from ompl import base as ob
+
+from vprism_plan.errors import PlanningError
+from vprism_plan.planning._motion_risk import KINDS, MotionRisk
+from vprism_plan.planning._spaces import StateReader
+from vprism_plan.planning.ompl_adapter import shortest_step, straight_pieces
+
+# Rates (n,) per metre at configurations (n, dof).
+Rates = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class RiskObjective:
+    """Asks `plan` for little risk in place of a short path.
+
+    Attributes:
+        kind: "joint", "survival", "occupancy" or "entropy"; see `VPrismRiskObjective`.
+        spacing: metres of sphere motion between samples of a motion.
+        length_weight: cost of a unit of path length (the state space's distance, radians
+            and metres alike), beside the risk. It also is what informed sampling and
+            pruning work with: without it they have no bound to use.
+        worst: make the largest rate of any state on the path small in place of the sum
+            (`VPrismMinimaxRiskObjective`); length then does not count.
+    """
+
+    kind: str = "joint"
+    spacing: float = 0.02
+    length_weight: float = 1e-3
+    worst: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise PlanningError(
+                f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}"
+            )
+        _require_weight(self.length_weight)
+
+    def cost(self, checker: Any) -> "PathCost":
+        """Return what paths of a checker's robot cost; draws and bakes worlds if need be."""
+        return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
+
+
+def _require_weight(value: Any) -> None:
+    if not (math.isfinite(value) and value >= 0.0):
+        raise PlanningError(f"length_weight is {value!r}; it must be finite and at least 0")
+
+
+class _FunctionRisk:
+    """`MotionRisk` for rates that a user's function gives; "metres" are those of joint space."""
+
+    def __init__(self, rates: Rates, spacing: float) -> None:
+        self.kind = "function"
+        self._rates = rates
+        self._spacing = spacing
+
+    def samples(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return rates at equal steps of a motion, and its length."""
+        way = float(np.linalg.norm(qb - qa))
+        t = np.linspace(0.0, 1.0, max(1, math.ceil(way / self._spacing)) + 1)[:, None]
+        return np.asarray(self._rates(qa + t * (qb - qa)), dtype=np.float64), way
+
+    def motion(self, qa: np.ndarray, qb: np.ndarray) -> float:
+        values, way = self.samples(qa, qb)
+        return way * float(np.mean(0.5 * (values[1:] + values[:-1])))
+
+    def worst(self, qa: np.ndarray, qb: np.ndarray) -> float:
+        return float(np.max(self.samples(qa, qb)[0]))
+
+    def state(self, q: np.ndarray) -> float:
+        return float(np.asarray(self._rates(q[None]))[0])
+
+
+class PathCost:
+    """What motions, and the paths they make up, cost by a risk objective; without OMPL.
+
+    Args:
+        checker: a `CollisionChecker` over a `World`; with a function anything with `robot`.
+        kind: of risk, or a function.
+        spacing: metres of sphere motion between samples.
+        length_weight: cost of a unit of length, see `VPrismRiskObjective`.
+        worst: whether the worst state counts alone.
+    """
+
+    def __init__(
+        self,
+        checker: Any,
+        kind: str | Rates = "joint",
+        spacing: float = 0.02,
+        length_weight: float = 1e-3,
+        worst: bool = False,
+    ) -> None:
+        _require_weight(length_weight)
+        self.risk: Any = (
+            MotionRisk(checker, kind, spacing)
+            if isinstance(kind, str)
+            else _FunctionRisk(kind, spacing)
+        )
+        self.length_weight = float(length_weight)
+        self.worst = worst
+        self._wraps = np.asarray(checker.robot.continuous, dtype=bool)
+
+    def edge(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+        """Return the cost of a straight motion; continuous joints turn as the difference says."""
+        pieces = list(pairwise(straight_pieces(qa, qb, self._wraps)))
+        if self.worst:
+            return max(float(self.risk.worst(a, b)) for a, b in pieces)
+        risk = sum(float(self.risk.motion(a, b)) for a, b in pieces)
+        return risk + self.length_weight * space_distance(qa, qb, self._wraps)
+
+    def path(self, path: Float[np.ndarray, "t dof"]) -> float:
+        """Return the cost of a path: the sum, or the largest, of its edges'."""
+        return self.combined([self.edge(a, b) for a, b in pairwise(path)])
+
+    def combined(self, costs: list[float]) -> float:
+        """Return what motions in a row cost together."""
+        return max(costs, default=0.0) if self.worst else float(sum(costs))
+
+
+def space_distance(
+    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], wraps: Bool[np.ndarray, " dof"]
+) -> float:
+    """Length of a straight motion in `state_space`: Euclidean over each run of limited joints,
+    the angle for each continuous one, all summed."""
+    step = np.abs(qb - qa)
+    if not wraps.any():
+        return float(np.linalg.norm(step))
+    total = float(step[wraps].sum())
+    ends = np.flatnonzero(np.diff(np.concatenate([[True], wraps, [True]]).astype(int)))
+    for begin, end in zip(ends[::2], ends[1::2], strict=True):
+        total += float(np.linalg.norm(step[begin:end]))
+    return total
+
+
+class _RiskBase(ob.OptimizationObjective):
+    """What both objectives share: reading states, and motions as the space interpolates them."""
+
+    def __init__(self, si: Any, checker: Any, cost: PathCost) -> None:
+        super().__init__(si)
+        space = si.getStateSpace()
+        self._cost = cost
+        self._reader = StateReader(space, checker.robot.dof)
+        self._distance = space.distance
+        self._wraps = np.array(self._reader.wraps)
+        self._turns = self._wraps | np.asarray(checker.robot.continuous, dtype=bool)
+        self._any_turns = bool(self._turns.any())
+
+    def _pieces(self, s1: Any, s2: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+        qa, qb = self._reader.read_pair(s1, s2)
+        if not self._any_turns:
+            return [(qa, qb)]
+        end = qa + shortest_step(qa, qb, self._wraps)
+        return list(pairwise(straight_pieces(qa, end, self._turns)))
+
+    def stateCost(self, state: Any) -> Any:  # noqa: N802 - OMPL's name
+        """Return the rate at a state."""
+        return ob.Cost(self._cost.risk.state(self._reader.read(state)))
+
+
+class VPrismRiskObjective(_RiskBase):
+    """Risk summed along the path, and length beside it.
+
+    cost(path) = sum over its motions of (risk of the motion + length_weight * length).
+
+    Kinds of risk; p is a share of the checker's posterior worlds:
+        "joint": -log(1 - p), p that the motion touches anything, in the same world from its
+            beginning to its end. Closest to the risk of the whole path: the sum over the
+            path counts twice only what touches on two of its motions.
+        "survival": integral along the motion, per metre, of -log(1 - p(q)), p(q) that the
+            robot touches anything at q. What touches one object over 10 cm costs ten times
+            what touches it over 1 cm, although the risk may be the same.
+        "occupancy": integral of the sum over spheres of the largest P(occupied) in each.
+        "entropy": integral of the mean entropy in the robot's volume, nats.
+        a function: integral of its values, (n, dof) -> (n,), over joint-space length.
+
+    Metres are those of the sphere that moves farthest (an upper bound). `MotionRisk` says how
+    it is computed. p counts from above, never past 1 - 1 / (2 n_worlds), so costs are finite.
+
+    Args:
+        si: the space information; one dimension per joint, flat order.
+        checker: a `CollisionChecker` over a `World`; with a function anything with `robot`.
+        kind: see above.
+        spacing: metres of sphere motion between samples.
+        length_weight: cost per unit of the space's distance; at least 0.
+        cost: in place of the last three, something prepared by `RiskObjective.cost`.
+
+    Raises:
+        PlanningError: a value out of range, or a checker without a posterior.
+    """
+
+    def __init__(
+        self,
+        si: Any,
+        checker: Any,
+        *,
+        kind: str | Rates = "joint",
+        spacing: float = 0.02,
+        length_weight: float = 1e-3,
+        cost: PathCost | None = None,
+    ) -> None:
+        cost = PathCost(checker, kind, spacing, length_weight) if cost is None else cost
+        super().__init__(si, checker, cost)
+        self._length_weight = cost.length_weight
+
+    def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
+        """Return the cost of the straight motion between two states."""
+        risk = self._cost.risk.motion
+        total = sum(risk(a, b) for a, b in self._pieces(s1, s2))
+        return ob.Cost(total + self._length_weight * self._distance(s1, s2))
+
+    def motionCostHeuristic(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
+        """Return what no path between the states undercuts: length, since risk is not negative."""
+        return ob.Cost(self._length_weight * self._distance(s1, s2))
+
+
+class VPrismMinimaxRiskObjective(_RiskBase):
+    """The largest rate of any state on the path.
+
+    cost(path) = max over the samples of its motions of the rate at the sample (kinds as in
+    `VPrismRiskObjective`; for "joint" of -log(1 - p) of each whole motion). Many paths share
+    one worst state, so the rest of the path is left to chance.
+
+    Args and errors as `VPrismRiskObjective`, without a weight of length.
+    """
+
+    def __init__(
+        self,
+        si: Any,
+        checker: Any,
+        *,
+        kind: str | Rates = "survival",
+        spacing: float = 0.02,
+        cost: PathCost | None = None,
+    ) -> None:
+        super().__init__(
+            si, checker, PathCost(checker, kind, spacing, 0.0, True) if cost is None else cost
+        )
+
+    def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
+        """Return the largest rate on the straight motion between two states."""
+        worst = self._cost.risk.worst
+        return ob.Cost(max(worst(a, b) for a, b in self._pieces(s1, s2)))
+
+    def motionCostHeuristic(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
+        """Return zero: some path may run no risk."""
+        return ob.Cost(0.0)
+
+    def combineCosts(self, c1: Any, c2: Any) -> Any:  # noqa: N802 - OMPL's name
+        """Return the larger cost."""
+        return ob.Cost(max(c1.value(), c2.value()))
+
+    def identityCost(self) -> Any:  # noqa: N802 - OMPL's name
+        """Return zero, which no rate is below."""
+        return ob.Cost(0.0)
+
+
+def make_objective(si: Any, checker: Any, cost: PathCost) -> Any:
+    """Return the OMPL objective for a prepared cost."""
+    if cost.worst:
+        return VPrismMinimaxRiskObjective(si, checker, cost=cost)
+    return VPrismRiskObjective(si, checker, cost=cost)
