@@ -9,6 +9,7 @@ along all. Writes docs/results/lattice.md.
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +20,11 @@ from vprism_plan.mapping import MapConfig
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = {
-    "4 cm, 48 surface hinges, plain EM": MapConfig(
-        hinge_spacing=0.04, surface_hinges=48, relaxation=1.0
+    "4 cm, 48 surface hinges, plain EM, 2.2 cm kernel": replace(
+        MapConfig.fine(), hinge_spacing=0.04, surface_hinges=48, relaxation=1.0, iterations=6
     ),
-    "default (3.4 cm)": MapConfig(),
-    "fine (2.8 cm)": MapConfig.fine(),
+    "default (2.8 cm, 1.8 cm kernel)": MapConfig(),
+    "fine (2.8 cm, 2.2 cm kernel)": MapConfig.fine(),
 }
 
 

@@ -15,32 +15,34 @@ from vprism_plan.evaluation.experiments.tuning import SETS, compare
 from vprism_plan.mapping import MapConfig
 
 ROOT = Path(__file__).resolve().parent.parent
-FINER = replace(
+BEFORE = replace(
     MapConfig(),
-    gamma=1500.0,
-    hinge_spacing=0.028,
-    object_resolution=0.007,
-    front_resolution=0.007,
-    prior_logit_variance=20.0,
-    hinge_reach=0.04,
+    gamma=1000.0,
+    hinge_spacing=0.034,
+    hinge_reach=None,
+    object_resolution=0.01,
+    front_resolution=0.01,
+    prior_logit_variance=10.0,
 )
+WIDER = replace(MapConfig(), prior_occupancy=0.3)
 CANDIDATES = {
     "default": MapConfig(),
     "fine": MapConfig.fine(),
-    "points-7mm": replace(MapConfig(), object_resolution=0.007, front_resolution=0.007),
-    "variance-30": replace(MapConfig(), prior_logit_variance=30.0),
-    "finer": FINER,
-    "finer-all-nodes": replace(FINER, hinge_reach=None),
-    "finer-occupancy-0.3": replace(FINER, prior_occupancy=0.3),
-    "finer-variance-40": replace(FINER, prior_logit_variance=40.0, prior_occupancy=0.3),
-    "finer-variance-100": replace(FINER, prior_logit_variance=100.0, prior_occupancy=0.3),
-    "finest": replace(FINER, gamma=2000.0, hinge_spacing=0.024, hinge_reach=0.035),
+    "before": BEFORE,
+    "points-7mm": replace(BEFORE, object_resolution=0.007, front_resolution=0.007),
+    "all-nodes": replace(MapConfig(), hinge_reach=None),
+    "variance-10": replace(MapConfig(), prior_logit_variance=10.0),
+    "variance-40": replace(MapConfig(), prior_logit_variance=40.0),
+    "occupancy-0.3": WIDER,
+    "occupancy-0.3-variance-40": replace(WIDER, prior_logit_variance=40.0),
+    "occupancy-0.3-variance-100": replace(WIDER, prior_logit_variance=100.0),
+    "finest": replace(MapConfig(), gamma=2000.0, hinge_spacing=0.024, hinge_reach=0.035),
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", default=["default", "finer"])
+    parser.add_argument("names", nargs="*", default=["before", "default"])
     parser.add_argument("--scenes", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=20)
     parser.add_argument("--set", nargs="+", default=["ycb", "random-train"], choices=SETS)
@@ -54,11 +56,11 @@ def main() -> None:
     for kind in args.set:
         rows = compare(settings, kind, seeds, ROOT / "build" / "tuning", jobs=args.jobs)
         print(f"{kind}, seeds {seeds.start} to {seeds.stop - 1}")
-        print(f"{'':22s} IoU   Chamfer    fit   gain in IoU           Chamfer saved     Brier  ECE")
+        print(f"{'':28s} IoU   Chamfer    fit   gain in IoU           Chamfer saved     Brier  ECE")
         for row in rows:
             iou, chamfer, brier, ece = row.gains
             print(
-                f"{row.name:20s} {row.iou:5.3f} {1000 * row.chamfer:6.1f} mm {row.seconds:5.1f} s "
+                f"{row.name:26s} {row.iou:5.3f} {1000 * row.chamfer:6.1f} mm {row.seconds:5.1f} s "
                 f"{iou.value:+.3f} [{iou.low:+.3f} {iou.high:+.3f}] {100 * chamfer.value:+4.0f} % "
                 f"[{100 * chamfer.low:+.0f} {100 * chamfer.high:+.0f}] {brier.value:+.3f} "
                 f"{ece.value:+.3f}"

@@ -80,9 +80,9 @@ def test_a_rigid_motion_moves_the_map_along(scene, coarse):
     plane = Plane([0.0, 0.0, 1.0], 0.0)
     motion = np.eye(4)
     motion[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    motion[:3, 3] = [0.6, -1.2, 0.0]
+    motion[:3, 3] = [0.42, -0.84, 0.0]
     # Without drawn samples nothing depends on which random number meets which ray, and the
-    # subsampling grids (1 and 1.5 cm) divide the shift.
+    # subsampling grids (7 and 15 mm) divide the shift.
     config = dataclasses.replace(
         coarse, surface_hinges=0, below_plane_samples=0, ray_step=50.0, object_radius=0.15
     )

@@ -83,9 +83,9 @@ class MapConfig:
     Hinge points
         hinge_spacing: edge of the lattice cell, m. It decides how much the answers
             depend on where the lattice happens to lie. Shifted by half a cell, the risk of
-            a path 5 mm or more behind a ball moves by at most 0.05 at 1.5 kernel lengths
-            (the default) and at 1.25 (`fine`); of one that just touches, where a
-            millimetre decides, by up to 0.4 and 0.1 (`docs/results/lattice.md`).
+            a path 5 mm or more behind a ball moves by at most 0.1 (the default, 1.5 kernel
+            lengths) or 0.01 (`fine`, 1.25); of one that just touches, where a millimetre
+            decides, by up to 0.4 and 0.1 (`docs/results/lattice.md`).
         hinge_shift: offset of the lattice from multiples of the spacing, m.
         hinge_radius: lattice nodes are kept this near an object's box centre, m ...
         hinge_margin: ... or this near its axis-aligned box, m.
@@ -141,14 +141,14 @@ class MapConfig:
         max_points: empty points above this total are dropped at random.
     """
 
-    gamma: float = 1000.0
+    gamma: float = 1500.0
     kernel_cutoff: float = 1e-5
-    hinge_spacing: float = 0.034
+    hinge_spacing: float = 0.028
     hinge_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     hinge_radius: float = 0.12
     hinge_margin: float = 0.08
     hinge_depth: float | None = 0.05
-    hinge_reach: float | None = None
+    hinge_reach: float | None = 0.04
     box_trim: float = 0.01
     stray_share: float = 0.03
     surface_hinges: int = 0
@@ -157,7 +157,7 @@ class MapConfig:
     variational_updates: int = 3
     relaxation: float = 1.9
     tolerance: float = 1e-5
-    prior_logit_variance: float | None = 10.0
+    prior_logit_variance: float | None = 20.0
     prior_weight_variance: float | None = None
     bias_variance: float = 1e-8
     prior_occupancy: float | None = 0.2
@@ -166,10 +166,10 @@ class MapConfig:
     ray_sampling: RaySampling = "stratified"
     below_plane_samples: int = 4000
     below_plane_margin: float = 0.0
-    object_resolution: float | None = 0.01
+    object_resolution: float | None = 0.007
     empty_resolution: float | None = 0.015
     front_distance: float | None = 0.005
-    front_resolution: float = 0.01
+    front_resolution: float = 0.007
     max_points: int = 150_000
 
     def __post_init__(self) -> None:
@@ -228,12 +228,21 @@ class MapConfig:
 
     @classmethod
     def fine(cls) -> "MapConfig":
-        """Return the default with a finer lattice, nearer to convergence.
+        """Return a lattice whose place hardly matters, for risks that have to be exact.
 
-        Its spacing is 1.25 kernel lengths; take it where probabilities matter more than
-        fitting time (four to five times the default's).
+        A wider kernel (2.2 cm) and a spacing of 1.25 of its lengths instead of 1.5, nearer
+        to convergence. It blurs surfaces more than the default (`docs/decisions.md`) and
+        takes about three times its fitting time.
         """
-        return cls(hinge_spacing=0.028, iterations=10)
+        return cls(
+            gamma=1000.0,
+            hinge_spacing=0.028,
+            hinge_reach=None,
+            iterations=10,
+            prior_logit_variance=10.0,
+            object_resolution=0.01,
+            front_resolution=0.01,
+        )
 
     @property
     def kernel_length(self) -> float:
