@@ -6,10 +6,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
-EXTRAS ?= dev,evaluation
+EXTRAS ?= dev,evaluation,docs,viewer
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint types bench clean
+.PHONY: demo test lint types docs bench clean
 
 demo: $(STAMP)
 	$(BIN)/vprism-plan demo --output out/demo
@@ -23,6 +23,10 @@ lint: $(STAMP)
 
 types: $(STAMP)
 	$(BIN)/mypy
+
+# Runs every example, once: a failure, a missing picture or a warning fails the build.
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs/html
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/run_all.py

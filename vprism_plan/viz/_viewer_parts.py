@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vprism_plan.robots import Robot
 
 _CHUNK = 1 << 16
+_SUPPORTED = 0.5  # of the largest kernel mass: the rim of the lattice has less
 _MOST = 2_000_000  # grid points; a coarser grid is taken above
 
 
@@ -29,7 +30,8 @@ class EntropyVolume:
     Attributes:
         corners: (2, 3) first and last grid point, m.
         heights: lowest and highest slice and their distance, m.
-        values: (nx, ny, nz) nats; NaN where no hinge reaches.
+        values: (nx, ny, nz) nats; NaN where the map has little support (see `_SUPPORTED`):
+            there it repeats its prior.
     """
 
     def __init__(self, m: "VPrismMap", resolution: float) -> None:
@@ -46,7 +48,8 @@ class EntropyVolume:
             [m.support(points[i : i + _CHUNK]) for i in range(0, len(points), _CHUNK)]
         )
         shape = tuple(len(axis) for axis in self._axes)
-        self.values: np.ndarray = np.where(mass > 0.0, values, np.nan).reshape(shape)
+        supported = mass > _SUPPORTED * mass.max()
+        self.values: np.ndarray = np.where(supported, values, np.nan).reshape(shape)
         self._grid = grid
         self._top = float(np.log(m.n_classes))
         z = self._axes[2]

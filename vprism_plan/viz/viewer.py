@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _POINTS = 20_000  # of an object, drawn at most
 _POSES = 300  # of a trajectory
-_ROBOT_COLOR = (0.62, 0.64, 0.68)
+_ROBOT_COLOR = (0.30, 0.42, 0.58)
 
 
 class Viewer:
@@ -121,7 +121,7 @@ class Viewer:
                 )
 
     def show_entropy(self, at_least: float) -> None:
-        """Draw the points of the map's support whose entropy (nats) is at least this."""
+        """Draw the points that the map supports and whose entropy (nats) is at least this."""
         points, colors = self._volume.cloud(float(at_least))
         with self._lock:
             self._remove("/entropy/cloud")
@@ -197,7 +197,7 @@ class Viewer:
         if self.robot is not None:
             self._add_robot()
         eye = self.map.views[0].camera_center
-        self.server.initial_camera.position = tuple(middle + 1.6 * (eye - middle))
+        self.server.initial_camera.position = tuple(middle + 1.5 * (eye - middle))
         self.server.initial_camera.look_at = tuple(middle)
 
     def _table_height(self, at: Float[np.ndarray, "3"]) -> float:
