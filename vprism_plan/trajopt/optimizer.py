@@ -17,6 +17,7 @@ from vprism_plan.planning._risk import within_risk
 from vprism_plan.planning._runtime import checked_seed
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.trajopt._candidates import Candidates, Settings, path_clearance
+from vprism_plan.trajopt._default_cost import Defaults, has_world
 from vprism_plan.trajopt._seeds import make_seeds
 from vprism_plan.trajopt.result import OptimizeReport, OptimizeResult, SeedReport
 
@@ -71,7 +72,8 @@ def optimize(
         seed: of the random seeds. The same arguments give the same result, unless the time
             limit strikes.
         time_limit: seconds after which nothing more is evaluated; what there is then is
-            still verified. None: no limit.
+            still verified. None: no limit. Building the default cost counts (seconds, if
+            risk is bounded): build it once and pass it as `cost` where queries follow.
         guard: cost of being where the checker refuses, which repairs add. None: the
             default cost's own terms with a margin that grows; without a `World` nothing is
             repaired.
@@ -109,9 +111,10 @@ def optimize(
             return _refused(refusal, replace(report, total_time=time.perf_counter() - began))
     begun, paths = make_seeds(checker, q_start, q_goal, _paths(initial), seeds, waypoints, number)
     kept = _kept(checker, keep_clearance, paths, clearance_step)
+    minimised, guards = _costs(checker, cost, guard, kept)
     settings = Settings(
-        cost=_cost(checker, cost, kept),
-        guard=_guard(checker, guard, kept),
+        cost=minimised,
+        guard=guards,
         method=method,
         iterations=max_iterations,
         tolerance=tolerance,
@@ -190,28 +193,22 @@ def _kept(
     return max(path_clearance(checker, path, step)[0] for path in paths)
 
 
-def _cost(checker: CheckerLike, cost: Any, kept: float | None) -> Any:
-    if cost is not None:
-        if not callable(cost):
+def _costs(
+    checker: CheckerLike, cost: Any, guard: Any, kept: float | None
+) -> tuple[Any, Callable[[int], Any] | None]:
+    """Return what is minimised, and what repairs add by their number (None if nothing)."""
+    for name, given in (("cost", cost), ("guard", guard)):
+        if given is not None and not callable(given):
             raise PlanningError(
-                f"cost is a {type(cost).__name__}; it must be a trajectory cost, a module "
+                f"{name} is a {type(given).__name__}; it must be a trajectory cost, a module "
                 "(..., T, dof) -> (...)"
             )
-        return cost
-    from vprism_plan.trajopt._default_cost import default_cost
-
-    return default_cost(checker, kept)
-
-
-def _guard(checker: CheckerLike, guard: Any, kept: float | None) -> Callable[[int], Any] | None:
-    """Return what repairs add, by their number; None if nothing can be."""
-    if guard is not None:
-        return lambda _: guard
-    from vprism_plan.trajopt._default_cost import default_guard, has_world
-
-    if not has_world(checker):
-        return None
-    return lambda level: default_guard(checker, level, kept)
+    guards = None if guard is None else lambda _: guard
+    if cost is None or (guard is None and has_world(checker)):
+        defaults = Defaults(checker, kept)
+        cost = defaults.cost() if cost is None else cost
+        guards = defaults.guard if guards is None else guards
+    return cost, guards
 
 
 def _refused(refusal: PlanResult, report: OptimizeReport) -> OptimizeResult:

@@ -7,6 +7,7 @@ from vprism_plan.viz.margin_plot import margin_figure
 from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample, sphere_centers
 from vprism_plan.viz.risk_plot import risk_figure
 from vprism_plan.viz.scene_plot import scene_figure
+from vprism_plan.viz.trajopt_plot import trajopt_figure
 
 __all__ = [
     "hand_path",
@@ -19,4 +20,5 @@ __all__ = [
     "save_figure",
     "scene_figure",
     "sphere_centers",
+    "trajopt_figure",
 ]
