@@ -82,38 +82,27 @@ def _place(q, rf, ri, T, L, C):
 
 
 @njit(cache=True, nogil=True)
-def _joint_gradient(T, C, F, active, rf, ri, W, tau):
-    """Fill tau (dof,) with the gradient that forces F (3, spheres) at the centres make.
+def _add_wrench(W, f, px, py, pz, x, y, z):
+    """Add a force at a point, and its moment about the world's origin, to a frame's."""
+    W[f, 0] += x
+    W[f, 1] += y
+    W[f, 2] += z
+    W[f, 3] += py * z - pz * y
+    W[f, 4] += pz * x - px * z
+    W[f, 5] += px * y - py * x
 
-    Only links that are active have forces.
-    """
-    for f in range(ri[0]):
-        for a in range(6):
-            W[f, a] = 0.0
-    for link in range(ri[2]):
-        if not active[link]:
-            continue
-        li = ri[9] + 4 * link
-        f = ri[li]
-        for s in range(ri[li + 1], ri[li + 2]):
-            x = F[0, s]
-            y = F[1, s]
-            z = F[2, s]
-            W[f, 0] += x
-            W[f, 1] += y
-            W[f, 2] += z
-            W[f, 3] += C[1, s] * z - C[2, s] * y
-            W[f, 4] += C[2, s] * x - C[0, s] * z
-            W[f, 5] += C[0, s] * y - C[1, s] * x
+
+@njit(cache=True, nogil=True)
+def _wrench_gradient(T, rf, ri, W, tau):
+    """Fill tau (dof,) with the gradient that wrenches W (frames, 6) make; W is used up."""
     for j in range(ri[4]):
         tau[j] = 0.0
     fi = ri[8]
     for f in range(ri[0] - 1, 0, -1):
-        kind = ri[fi + 3 * f + 1]
         ax = T[f, 2]
         ay = T[f, 5]
         az = T[f, 8]
-        if kind == 2:
+        if ri[fi + 3 * f + 1] == 2:
             value = ax * W[f, 0] + ay * W[f, 1] + az * W[f, 2]
         else:
             px = T[f, 9]
@@ -129,20 +118,48 @@ def _joint_gradient(T, C, F, active, rf, ri, W, tau):
 
 
 @njit(cache=True, nogil=True)
-def place_all(Q, rf, ri, T, C):
-    """Place frames T (n, frames, 12) and sphere centres C (n, 3, spheres) for each row of Q."""
-    L = np.empty((ri[2], 3))
-    for n in range(len(Q)):
-        _place(Q[n], rf, ri, T[n], L, C[n])
+def _joint_gradient(T, C, F, active, rf, ri, W, tau):
+    """Fill tau (dof,) with the gradient that forces F (3, spheres) at the centres make.
+
+    Only links that are active have forces.
+    """
+    W[:] = 0.0
+    for link in range(ri[2]):
+        if not active[link]:
+            continue
+        li = ri[9] + 4 * link
+        for s in range(ri[li + 1], ri[li + 2]):
+            _add_wrench(W, ri[li], C[0, s], C[1, s], C[2, s], F[0, s], F[1, s], F[2, s])
+    _wrench_gradient(T, rf, ri, W, tau)
 
 
 @njit(cache=True, nogil=True)
-def pull_all(T, C, F, rf, ri, grad):
-    """Fill grad (n, dof) with what forces F (n, 3, spheres) at the centres make."""
-    active = np.ones(ri[2], np.bool_)
+def place_all(Q, rf, ri, spheres, T, out):
+    """Place frames T (n, frames, 12) and the centres out (n, c, 3) of some spheres."""
+    L = np.empty((ri[2], 3))
+    C = np.empty((3, ri[1]))
+    for n in range(len(Q)):
+        _place(Q[n], rf, ri, T[n], L, C)
+        for c in range(len(spheres)):
+            for a in range(3):
+                out[n, c, a] = C[a, spheres[c]]
+
+
+@njit(cache=True, nogil=True)
+def pull_all(T, centers, frames, forces, rf, ri, grad):
+    """Fill grad (n, dof) with what forces (n, c, 3) at centres that move with frames make."""
     W = np.empty((ri[0], 6))
-    for n in range(len(F)):
-        _joint_gradient(T[n], C[n], F[n], active, rf, ri, W, grad[n])
+    for n in range(len(forces)):
+        W[:] = 0.0
+        for c in range(len(frames)):
+            x = forces[n, c, 0]
+            y = forces[n, c, 1]
+            z = forces[n, c, 2]
+            if x != 0.0 or y != 0.0 or z != 0.0:
+                _add_wrench(
+                    W, frames[c], centers[n, c, 0], centers[n, c, 1], centers[n, c, 2], x, y, z
+                )
+        _wrench_gradient(T[n], rf, ri, W, grad[n])
 
 
 @njit(cache=True, nogil=True)
@@ -307,9 +324,13 @@ def _distance(V, rule, origin, h, solid, x, y, z, slope):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _block_bound(E, rule, wf, V, x, y, z):
-    """Lower bound of the spline at a point, from the least node of the 4 x 4 x 4 cells around
-    it and those next to them; outside a grid that is no obstacle, too."""
+def _may_be_below(V, E, rule, wf, x, y, z, need):
+    """Whether the spline may be below `need` at a point, by two bounds that cost less.
+
+    E holds the least node of each 4 x 4 x 4 cells and those next to them. And nodes hold
+    distances, 1-Lipschitz: the 27 nodes lie within sqrt(3) steps of the middle one. Outside the
+    grid the spline at the nearest point of it counts, unless everything there is an obstacle.
+    """
     gx = (x - wf[0]) / wf[3]
     gy = (y - wf[1]) / wf[3]
     gz = (z - wf[2]) / wf[3]
@@ -317,8 +338,10 @@ def _block_bound(E, rule, wf, V, x, y, z):
     cy = min(max(gy, 0.0), V.shape[2] - 1.0)
     cz = min(max(gz, 0.0), V.shape[3] - 1.0)
     if wf[4] > 0.0 and (cx != gx or cy != gy or cz != gz):
-        return -np.inf
-    return float(E[rule, int(cx) >> 2, int(cy) >> 2, int(cz) >> 2])
+        return True
+    if E[rule, int(cx) >> 2, int(cy) >> 2, int(cz) >> 2] >= need:
+        return False
+    return V[rule, int(cx + 0.5), int(cy + 0.5), int(cz + 0.5)] < need + 1.75 * wf[3]
 
 
 @njit(cache=True, nogil=True)
@@ -337,14 +360,13 @@ def _obstacle_terms(T, L, C, placed, rf, ri, V, E, wf, radii, grown, slope, valu
         active[link] = False
         if rule < 0:
             continue
-        # Nodes hold distances: 1-Lipschitz. The spline at a sphere's centre lies between nodes
-        # at most 2.6 steps from it, the node at the ball's centre is within 0.9 of that, and
-        # `grown` adds at most 0.9 to a radius; the block's own bound comes for free.
+        # The spline at a sphere's centre lies between nodes at most 2.6 steps from it, a node is
+        # within 0.9 of the ball's centre, and `grown` adds at most 0.9 to a radius.
         ball = rf[ri[18] + 4 * link + 3] + wf[7]
         x = L[link, 0]
         y = L[link, 1]
         z = L[link, 2]
-        near = _block_bound(E, rule, wf, V, x, y, z) <= ball + margin + 4.4 * h
+        near = _may_be_below(V, E, rule, wf, x, y, z, ball + margin + 4.4 * h)
         for p in range(int(wf[5])):
             o = 8 + 4 * p
             away = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3]
@@ -363,7 +385,7 @@ def _obstacle_terms(T, L, C, placed, rf, ri, V, E, wf, radii, grown, slope, valu
             y = C[1, s]
             z = C[2, s]
             need = grown[s] + margin
-            if _block_bound(E, rule, wf, V, x, y, z) < need:
+            if _may_be_below(V, E, rule, wf, x, y, z, need):
                 gap = _distance(V, rule, wf, h, wf[4] > 0.0, x, y, z, slope) - grown[s]
                 if gap < margin:
                     found = True
@@ -526,7 +548,7 @@ def certain_hazards(centers, rules, V, E, wf, radii, grown, soft, cut, value, sl
             z = centers[n, s, 2]
             value[n, s] = 0.0
             slopes[n, s] = 0.0
-            if _block_bound(E, rules[s], wf, V, x, y, z) < grown[s] + far:
+            if _may_be_below(V, E, rules[s], wf, x, y, z, grown[s] + far):
                 away = _distance(V, rules[s], wf, wf[3], wf[4] > 0.0, x, y, z, slope)
                 value[n, s], steep = _soft_contact((grown[s] - away) / soft, cut)
                 for a in range(3):
@@ -770,7 +792,7 @@ def _near_certain(centers, rules, grown, radii, V, E, wf, reach, which, depth, s
             x = centers[i, s, 0]
             y = centers[i, s, 1]
             z = centers[i, s, 2]
-            if _block_bound(E, rules[s], wf, V, x, y, z) < grown[s] + reach:
+            if _may_be_below(V, E, rules[s], wf, x, y, z, grown[s] + reach):
                 if kept:
                     value = _distance(V, rules[s], wf, wf[3], wf[4] > 0.0, x, y, z, slope)
                     which[found, 0] = i

@@ -82,8 +82,7 @@ class PathKernels:
         Raises:
             RobotError: q is not finite.
         """
-        if not bool(torch.isfinite(q.detach()).all()):
-            raise RobotError("q holds NaN or infinite values; give finite joint values")
+        require_finite(q)
 
         def work(Q: np.ndarray) -> tuple[np.ndarray, Pull]:
             values, grad = np.empty(len(Q)), np.zeros(Q.shape)
@@ -97,34 +96,52 @@ class PathKernels:
 
         return compiled(q, work, plain)
 
-    def sphere_centers(self, q: Float[Tensor, "n dof"]) -> Float[Tensor, "n s 3"]:
-        """Return `robot.sphere_centers`, metres, differentiable in q to any order."""
-        kernel_arguments = self.floats, self.ints
+    def sphere_centers(
+        self, q: Float[Tensor, "n dof"], spheres: Int[np.ndarray, " s"] | None = None
+    ) -> Float[Tensor, "n s 3"]:
+        """Return `robot.sphere_centers` of some spheres (None is all), metres.
+
+        Raises:
+            RobotError: q is not finite.
+        """
+        require_finite(q)
+        if spheres is None:
+            spheres = np.arange(int(self.ints[1]))
+        frames = self._robot.arrays.sphere_frame[spheres]
+        robot = self.floats, self.ints
 
         def work(Q: np.ndarray) -> tuple[np.ndarray, Pull]:
-            frames = np.empty((len(Q), int(self.ints[0]), 12))
-            centers = np.empty((len(Q), 3, int(self.ints[1])))
+            poses = np.empty((len(Q), int(self.ints[0]), 12))
+            centers = np.empty((len(Q), len(spheres), 3))
 
             def piece(part: slice) -> None:
-                kernels.place_all(Q[part], *kernel_arguments, frames[part], centers[part])
+                kernels.place_all(Q[part], *robot, spheres, poses[part], centers[part])
 
             run_chunked(piece, len(Q), _ROWS_AT_ONCE)
 
             def pull(output: np.ndarray) -> np.ndarray:
                 grad = np.empty(Q.shape)
-                forces = np.ascontiguousarray(np.moveaxis(output, 1, 2))
 
                 def piece(part: slice) -> None:
                     kernels.pull_all(
-                        frames[part], centers[part], forces[part], *kernel_arguments, grad[part]
+                        poses[part], centers[part], frames, output[part], *robot, grad[part]
                     )
 
                 run_chunked(piece, len(Q), _ROWS_AT_ONCE)
                 return grad
 
-            return np.moveaxis(centers, 1, 2), pull
+            return centers, pull
 
-        return compiled(q, work, self._robot.sphere_centers)
+        def plain(x: Tensor) -> Tensor:
+            return self._robot.sphere_centers(x)[:, torch.from_numpy(spheres)]
+
+        return compiled(q, work, plain)
+
+
+def require_finite(q: Tensor) -> None:
+    """Raise RobotError unless q is finite."""
+    if not bool(torch.isfinite(q.detach()).all()):
+        raise RobotError("q holds NaN or infinite values; give finite joint values")
 
 
 def compiled(x: Tensor, work: Work, plain: Plain) -> Tensor:
@@ -155,4 +172,8 @@ class _Compiled(torch.autograd.Function):
         if torch.is_grad_enabled():
             (found,) = torch.autograd.grad(ctx.plain(x), x, output, create_graph=True)
             return found, None, None
-        return torch.from_numpy(ctx.pull(output.to(torch.float64).numpy())).to(x.dtype), None, None
+        return (
+            torch.from_numpy(ctx.pull(output.to(torch.float64).contiguous().numpy())).to(x.dtype),
+            None,
+            None,
+        )

@@ -3,8 +3,9 @@
 
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vprism_plan.trajopt._compiled import PathKernels, checked_backend
@@ -68,10 +69,20 @@ class SphereCost(TrajectoryCost):
         self, q: Float[Tensor, "b time dof"]
     ) -> tuple[Samples, Float[Tensor, "m s 3"], bool]:
         """Samples, centres of the checked spheres at them, and whether kernels may be used."""
-        fast = self._compiled is not None and q.device.type == "cpu"
-        centers_of = self.robot.sphere_centers
-        if self._compiled is not None and fast:
-            centers_of = self._compiled.sphere_centers
-        samples = sample_paths(self.robot, q, self.subdivision, centers_of)
-        checked = torch.as_tensor(self._checked, device=q.device)
-        return samples, centers_of(samples.q)[:, checked], fast
+        return checked_spheres(self.robot, self._compiled, q, self.subdivision, self._checked)
+
+
+def checked_spheres(
+    robot: Any,
+    kernels: PathKernels | None,
+    q: Float[Tensor, "b time dof"],
+    subdivision: Subdivision,
+    checked: Int[np.ndarray, " s"],
+) -> tuple[Samples, Float[Tensor, "m s 3"], bool]:
+    """Samples of trajectories, the centres of some spheres at them, and whether by kernels."""
+    if kernels is not None and q.device.type == "cpu":
+        samples = sample_paths(robot, q, subdivision, kernels.sphere_centers)
+        return samples, kernels.sphere_centers(samples.q, checked), True
+    samples = sample_paths(robot, q, subdivision)
+    columns = torch.as_tensor(checked, device=q.device)
+    return samples, robot.sphere_centers(samples.q)[:, columns], False

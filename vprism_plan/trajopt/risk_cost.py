@@ -15,8 +15,9 @@ from vprism_plan.trajopt._compiled import PathKernels, Pull, checked_backend, co
 from vprism_plan.trajopt._draw_field import draw_field
 from vprism_plan.trajopt._draw_torch import survival_losses
 from vprism_plan.trajopt._field import SplineField, grown, union_field
-from vprism_plan.trajopt._samples import Subdivision, require_dof, sample_paths
+from vprism_plan.trajopt._samples import Subdivision, require_dof
 from vprism_plan.trajopt._scene import map_and_scene
+from vprism_plan.trajopt._spheres import checked_spheres
 from vprism_plan.trajopt.cost import TrajectoryCost, at_least
 from vprism_plan.world import PosteriorWorlds
 
@@ -114,13 +115,9 @@ class RiskCost(TrajectoryCost):
         """Return the cost without its weight."""
         require_dof(self.robot, q)
         flat = q.reshape(-1, *q.shape[-2:])
-        centers_of = self.robot.sphere_centers
-        fast = self._compiled is not None and q.device.type == "cpu"
-        if self._compiled is not None and fast:
-            centers_of = self._compiled.sphere_centers
-        samples = sample_paths(self.robot, flat, self.subdivision, centers_of)
-        checked = torch.as_tensor(self._checked, device=q.device)
-        centers = centers_of(samples.q)[:, checked]
+        samples, centers, fast = checked_spheres(
+            self.robot, self._compiled, flat, self.subdivision, self._checked
+        )
 
         def plain(x: Tensor) -> Tensor:
             return survival_losses(
