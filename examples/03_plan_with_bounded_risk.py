@@ -29,7 +29,7 @@ parser.add_argument("--map", type=Path, help="a saved map instead of the bundled
 arguments = parser.parse_args()
 
 # %%
-# World and robot as in the example before.
+# A map of the view, a world made of it, and the robot.
 m = (
     vp.load_map(arguments.map)
     if arguments.map
@@ -40,8 +40,8 @@ robot = vp.Robot.from_urdf(DATA / "urdf" / "panda.urdf", base_pose=BASE)
 
 # %%
 # Without a bound the checker refuses the level set P(occupied) >= 0.5 and nothing short of it. The
-# straight motion goes through objects. The planned path misses the level set and grazes it: the
-# probability that it touches something is still above one half.
+# straight motion goes through objects. The planned path keeps out of the level set, but only just,
+# and the true surface may lie a little farther out.
 plain = vp.CollisionChecker(world, robot)
 straight = plain.collision_probability([START, GOAL])
 print(f"straight to the goal: {straight.text()}")

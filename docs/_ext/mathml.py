@@ -20,7 +20,9 @@ def _inline(writer, node: nodes.math) -> None:
 
 
 def _block(writer, node: nodes.math_block) -> None:
-    writer.body.append(f'<div class="math">{_translate(node, block=True)}</div>')
+    # Not class "math": the theme would give it scroll bars. Wide ones still scroll sideways.
+    style = "overflow-x: auto; overflow-y: hidden; padding: 0.4em 0"
+    writer.body.append(f'<div style="{style}">{_translate(node, block=True)}</div>')
     raise nodes.SkipNode
 
 

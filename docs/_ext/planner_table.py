@@ -21,14 +21,12 @@ class PlannerTable(Directive):
         """Return the table."""
         from vprism_plan.planning import planners
 
-        lines = [".. list-table::", "   :header-rows: 1", ""]
-        rows = [["planner", *_COLUMNS, "note"]]
+        header = ["planner", *_COLUMNS, "note"]
+        rows = [header, ["---"] * len(header)]
         for name, kind in planners().items():
             marks = ["yes" if getattr(kind, field) else "" for field in _COLUMNS.values()]
-            rows.append([f"``{name}``", *marks, kind.note.replace("`", "``")])
-        for row in rows:
-            for i, cell in enumerate(row):
-                lines.append(f"   {'*' if i == 0 else ' '} - {cell}".rstrip())
+            rows.append([f"`{name}`", *marks, kind.note])
+        lines = [f"| {' | '.join(row)} |" for row in rows]  # the pages are Markdown
         holder = nodes.Element()
         self.state.nested_parse(StringList(lines, "planners"), 0, holder)
         return holder.children
