@@ -3,6 +3,7 @@
 
 import copy
 import threading
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -226,6 +227,13 @@ class CollisionChecker(Queries):
         stricter = copy.copy(self)
         stricter._bounded = bounded
         return stricter
+
+    def with_extra_margin(self, extra: float) -> "CollisionChecker":
+        """Return the same checker with `extra` metres (at least 0) more margin."""
+        if not extra >= 0.0:
+            raise ConfigError(f"extra is {extra!r} m; a margin can only be widened")
+        config = replace(self.config, margin=self.config.margin + extra)
+        return CollisionChecker(self.world, self.robot, config)
 
     def explain(self, q: Numbers) -> StateReport:
         """Return the verdict on a configuration with every reason that refuses it.
