@@ -125,6 +125,8 @@ def random_urdf(rng: np.random.Generator, n_links: int) -> tuple[str, dict]:
         ]
         if movable and kind != "fixed" and rng.random() < 0.3:
             driver = movable[int(rng.integers(len(movable)))]
+            # Wide: followers would narrow the limits of what they follow.
+            body[-1] = '<limit lower="-1000" upper="1000" effort="1" velocity="2"/>'
             body.append(
                 f'<mimic joint="{driver}" multiplier="{rng.normal()!r}" offset="{rng.normal()!r}"/>'
             )

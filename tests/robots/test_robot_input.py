@@ -86,7 +86,7 @@ def test_sphere_files_may_be_nested_as_other_planners_write_them(write):
 
 def test_a_robot_without_any_shape_is_refused(write):
     bare = '<robot name="x"><link name="a"/><link name="b"/>' + joint("j1", "a", "b") + "</robot>"
-    with pytest.raises(RobotError, match="no collision geometry; pass spheres="):
+    with pytest.raises(RobotError, match=r"no link has collision geometry; .*pass spheres="):
         Robot.from_urdf(write(bare))
 
 
@@ -157,7 +157,13 @@ def test_without_an_srdf_only_what_always_touches_is_left_out(write, caplog):
     near_c = text.replace('xyz="0 0 0.3"', 'xyz="0 0 0.02"')
     robot = Robot.from_urdf(write(near_c))
     pairs = {(robot.link_names[i], robot.link_names[j]) for i, j in robot.collision_pairs}
-    assert pairs == {("a", "d"), ("b", "d")}
+    assert pairs == set()
+    reasons = {tuple(sorted(pair)): why for pair, why in robot.disabled_pairs.items()}
+    assert reasons == {
+        **dict.fromkeys([("a", "b"), ("b", "c"), ("c", "d")], "Adjacent"),
+        ("a", "c"): "Always",
+        **dict.fromkeys([("a", "d"), ("b", "d")], "Never"),
+    }
     assert "their spheres always overlap: [('a', 'c')]" in caplog.text
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from vprism_plan.robots._arrays import KIND_FIXED, KIND_PRISMATIC, KIND_REVOLUTE, KinematicArrays
 from vprism_plan.robots._model import Joint, RobotModel
-from vprism_plan.robots._spheres import LinkSpheres
+from vprism_plan.robots._sphere_files import LinkSpheres
 
 
 @dataclass(frozen=True)

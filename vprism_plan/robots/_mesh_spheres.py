@@ -24,16 +24,19 @@ _CHUNK = 20_000
 _MAX_EXTENT = 5.0
 
 
-def read_triangles(mesh: Any, what: str) -> Float[np.ndarray, "f 3 3"]:
+def read_triangles(
+    mesh: Any, what: str, max_extent: float = _MAX_EXTENT
+) -> Float[np.ndarray, "f 3 3"]:
     """Triangles of a mesh or of a mesh file, metres.
 
     Args:
         mesh: A ``trimesh.Trimesh``, or the path of a file that trimesh reads.
         what: Whose mesh it is, for messages.
+        max_extent: Metres; what is longer is not in metres.
 
     Raises:
         RobotError: There is no such file, it holds no triangles, a vertex is not finite,
-            or it is larger than any arm carries.
+            or it is larger than `max_extent`.
     """
     if isinstance(mesh, str | Path):
         import trimesh
@@ -57,10 +60,11 @@ def read_triangles(mesh: Any, what: str) -> Float[np.ndarray, "f 3 3"]:
     if not np.isfinite(triangles).all():
         raise RobotError(f"{what}: the mesh has vertices that are not finite")
     extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
-    if not 0.0 < extent <= _MAX_EXTENT:
+    if not 0.0 < extent <= max_extent:
         raise RobotError(
             f"{what}: the mesh is {extent:.6g} m long; it must be more than 0 and at most "
-            f"{_MAX_EXTENT:g} m (a mesh in millimetres: mesh.apply_scale(0.001))"
+            f'{max_extent:g} m (a mesh in millimetres: mesh.apply_scale(0.001), or scale="0.001 '
+            '0.001 0.001" in a URDF)'
         )
     return np.asarray(triangles, dtype=np.float64)
 
@@ -97,7 +101,7 @@ def mesh_spheres(
     index = np.argwhere(filled)
     centers = lower + cell * (index + 0.5)
     depth = _depth(filled, index, cell)
-    chosen = _candidates(depth)
+    chosen = candidate_cells(depth)
     # Distance from each candidate to the farthest corner of each cell.
     reach = np.empty((len(chosen), len(index)), dtype=np.float32)
     for row, candidate in enumerate(chosen):
@@ -105,12 +109,12 @@ def mesh_spheres(
         # Rounded up, so that single precision never calls a corner covered that is not.
         reach[row] = np.sqrt(np.einsum("ij,ij->i", far, far)) * (1.0 + 1e-6)
     low, high = 0.0, float(reach.max())
-    best = _greedy(reach, depth[chosen] + high, 1)
+    best = greedy_cover(reach, depth[chosen] + high, 1)
     assert best is not None  # one sphere of that reach holds everything
     protrusion = high
     for _ in range(10):
         middle = 0.5 * (low + high)
-        found = _greedy(reach, depth[chosen] + middle, max_spheres)
+        found = greedy_cover(reach, depth[chosen] + middle, max_spheres)
         if found is None:
             low = middle
         else:
@@ -220,16 +224,16 @@ def _depth(
     return depth
 
 
-def _candidates(depth: Float[np.ndarray, "n"]) -> Int[np.ndarray, "c"]:
+def candidate_cells(depth: Float[np.ndarray, "n"], most: int = _CANDIDATES) -> Int[np.ndarray, "c"]:
     """Cells to centre spheres on: the deepest ones and an even selection of the others."""
-    if len(depth) <= _CANDIDATES:
+    if len(depth) <= most:
         return np.arange(len(depth))
-    deepest = np.argsort(-depth, kind="stable")[: _CANDIDATES // 4]
-    spread = np.linspace(0, len(depth) - 1, _CANDIDATES - len(deepest)).astype(np.int64)
+    deepest = np.argsort(-depth, kind="stable")[: most // 4]
+    spread = np.linspace(0, len(depth) - 1, most - len(deepest)).astype(np.int64)
     return np.unique(np.concatenate([deepest, spread]))
 
 
-def _greedy(
+def greedy_cover(
     reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int
 ) -> list[tuple[int, float]] | None:
     """Choose spheres until all cells are held: each time the one that holds most new cells.

@@ -42,8 +42,14 @@ def padded(
     touching = touching_pairs(arrays, robot.neutral, names) - before
     if touching:
         _logger.warning("the scale makes links touch in the neutral state: %s", sorted(touching))
+    changed = {name for i, name in enumerate(names) if scales[i] != 1.0 or pads[i] > 0.0}
     return dataclasses.replace(
-        robot, arrays=arrays, geometry=geometry, _torch=TorchKinematics(arrays)
+        robot,
+        arrays=arrays,
+        geometry=geometry,
+        # Nothing grows a mesh; who wants solids takes the spheres, which did grow.
+        meshes={name: files for name, files in robot.meshes.items() if name not in changed},
+        _torch=TorchKinematics(arrays),
     )
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -13,7 +12,6 @@ from vprism_plan.robots._arrays import KinematicArrays
 from vprism_plan.robots._frames import Attachment, place_spheres
 from vprism_plan.robots._model import RobotModel
 
-_logger = logging.getLogger(__name__)
 _SAMPLES = 300
 
 
@@ -31,7 +29,7 @@ def candidate_pairs(
     Returns:
         (P, 2) indices into ``collision_links``, first < second, sorted.
     """
-    skipped = set(disabled) | _adjacent(model, set(collision_links))
+    skipped = set(disabled) | adjacent_pairs(model, set(collision_links))
     pairs = [
         (i, j)
         for i in range(len(collision_links))
@@ -42,7 +40,7 @@ def candidate_pairs(
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
-def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
+def adjacent_pairs(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
     """Each collision link with its nearest ancestor that is one too."""
     above = {joint.child: joint.parent for joint in model.joints}
     pairs = set()
@@ -87,18 +85,10 @@ def random_configurations(
     return rng.uniform(arrays.lower, arrays.upper, size=(n, len(arrays.lower)))
 
 
-def drop_always_touching(
-    arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"], names: Sequence[str]
-) -> Int[np.ndarray, "kept 2"]:
-    """Without an SRDF: leave out pairs whose spheres overlap in every sample.
-
-    Such a pair overlaps because of how the links are built (or of how coarse the
-    spheres are), not because of a pose; testing it would refuse every pose.
-    """
+def always_touching(
+    arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"]
+) -> Bool[np.ndarray, "pairs"]:
+    """Pairs whose spheres overlap at the joints' zero and in 300 random configurations."""
     samples = random_configurations(arrays, _SAMPLES, np.random.default_rng(0))
     at_zero = np.clip(np.zeros(len(arrays.lower)), arrays.lower, arrays.upper)
-    always = pairs_touching(arrays, np.vstack([at_zero, samples]), pairs).all(axis=0)
-    if always.any():
-        listed = [(names[a], names[b]) for a, b in pairs[always]]
-        _logger.warning("not tested for self-collision, their spheres always overlap: %s", listed)
-    return pairs[~always]
+    return np.asarray(pairs_touching(arrays, np.vstack([at_zero, samples]), pairs).all(axis=0))

@@ -18,13 +18,25 @@ ARM_GROUP = "arm"
 
 
 def choose_joints(
-    model: RobotModel, semantics: SemanticModel, joints: Sequence[str] | None
+    model: RobotModel,
+    semantics: SemanticModel,
+    joints: Sequence[str] | None,
+    group: str | None = None,
 ) -> tuple[str, ...]:
-    """The joints of a configuration: as given, else the SRDF group "arm", else all."""
+    """The joints of a configuration: given, of the group, of the group "arm", or else all."""
     valid = model.actuated
+    if group is not None:
+        if joints is not None:
+            raise RobotError(f"both joints and the group {group!r} are given; give one of them")
+        joints = [name for name in semantics.groups.get(group, ()) if name in valid]
+        if not joints:
+            raise RobotError(
+                f"the SRDF of '{model.name}' has no group {group!r} with joints that move; "
+                f"groups: {sorted(semantics.groups)}"
+            )
     if joints is None:
-        group = [name for name in semantics.groups.get(ARM_GROUP, ()) if name in valid]
-        chosen = tuple(group) or valid
+        arm = [name for name in semantics.groups.get(ARM_GROUP, ()) if name in valid]
+        chosen = tuple(arm) or valid
     elif isinstance(joints, str):
         raise RobotError(f"joints is the string {joints!r}; give a sequence of joint names")
     else:

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Collision spheres of links: read from a file, or tiled over primitives."""
+"""Collision spheres of links: from a file, of the URDF itself, or made to hold its geometry."""
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +15,54 @@ from jaxtyping import Float
 
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._geometry import PrimitiveGeometry
+from vprism_plan.robots._mesh_files import MeshFile
 from vprism_plan.robots._model import RobotModel
+from vprism_plan.robots._sphere_files import LinkSpheres, read_spheres
+from vprism_plan.robots._sphere_fit import SphereFit, fit_spheres
 
 # Pieces of about this size protrude by about half of it.
 _TILE_EDGE = 0.06
 _MAX_TILES = 64
 
-LinkSpheres = dict[str, np.ndarray]
-"""Link name -> (n, 4) rows (x, y, z, radius) in the link's frame, metres."""
+# So many tiles are taken as they are; what needs more is fitted, which needs fewer.
+_FEW_TILES = 12
+_logger = logging.getLogger(__name__)
+
+
+FIT = "fit"
+
+
+@dataclass(frozen=True)
+class ChosenSpheres:
+    """The spheres of a robot's links, and where they are from.
+
+    Attributes:
+        rows: Link -> (n, 4) rows (x, y, z, radius), link frame, metres; never empty.
+        sources: Link -> "file", "urdf" (spheres of its own), "tiled" (over its boxes and
+            cylinders) or "fitted".
+        padding: Link -> metres by which a foreign file wants them to grow.
+    """
+
+    rows: LinkSpheres
+    sources: dict[str, str]
+    padding: dict[str, float] = field(default_factory=dict)
 
 
 def link_spheres(
-    model: RobotModel, urdf_path: Path, spheres: str | Path | Mapping[str, Any] | None
-) -> LinkSpheres:
+    model: RobotModel,
+    urdf_path: Path,
+    spheres: str | Path | Mapping[str, Any] | None,
+    fit: SphereFit,
+) -> ChosenSpheres:
     """Choose and validate the collision spheres of a robot.
 
     Args:
         model: The robot.
         urdf_path: Where it was read from; ``<stem>_spheres.yml`` beside it is used
             when ``spheres`` is None.
-        spheres: A YAML file, a mapping ``{link: [{center, radius}, ...]}``, or None:
-            the file beside the URDF, else the URDF's own shapes (spheres as they
-            are, boxes and cylinders enclosed by tiles).
+        spheres: A file or mapping that :func:`read_spheres` understands; None: the file
+            beside the URDF, else from the URDF's own geometry; "fit": from that in any case.
+        fit: How spheres are fitted.
 
     Raises:
         RobotError: A sphere is malformed, names an unknown link, or a link with
@@ -42,93 +70,84 @@ def link_spheres(
     """
     if spheres is None:
         beside = urdf_path.with_name(f"{urdf_path.stem}_spheres.yml")
-        spheres = beside if beside.is_file() else None
-    if spheres is None:
-        return _from_geometry(model)
-    if isinstance(spheres, str | Path):
-        source = f"'{spheres}'"
-        table = _read_yaml(Path(spheres))
-    else:
-        source, table = "spheres", spheres
-    parsed: LinkSpheres = {}
-    for link, entries in table.items():
-        if link not in model.links:
+        spheres = beside if beside.is_file() else FIT
+    if isinstance(spheres, str) and spheres == FIT:
+        chosen = _from_geometry(model, tuple(model.links), fit)
+        if not chosen.rows:
             raise RobotError(
-                f"{source} gives spheres for the unknown link '{link}'; links: {list(model.links)}"
+                f"'{urdf_path}': no link has collision geometry; add <collision> elements, or pass "
+                "spheres={link: [{center, radius}]}"
             )
-        parsed[link] = _rows(link, entries, source)
-    bare = [
+        return chosen
+    table = read_spheres(spheres)
+    known = {name: rows for name, rows in table.spheres.items() if name in model.links}
+    for link, rows in table.spheres.items():
+        if link not in model.links and (len(rows) or not table.foreign):
+            raise RobotError(
+                f"{table.source} gives spheres for the unknown link '{link}'; "
+                f"links: {list(model.links)}"
+            )
+    bare = tuple(
         name
         for name, link in model.links.items()
-        if name not in parsed and (link.primitives or link.meshes)
-    ]
-    if bare:
+        if name not in known and (link.primitives or link.meshes)
+    )
+    if bare and not table.foreign:
         raise RobotError(
-            f"{source} gives no spheres for the links {bare}, which have collision geometry and "
-            "would go unchecked; add spheres, or an empty list to leave a link out on purpose"
+            f"{table.source} gives no spheres for the links {list(bare)}, which have collision "
+            "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
+            "on purpose"
         )
-    return {name: parsed[name] for name in model.links if len(parsed.get(name, ()))}
+    rest = _from_geometry(model, bare, fit)
+    if rest.rows:
+        _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
+    table_rows = known | rest.rows
+    order = [name for name in model.links if len(table_rows.get(name, ()))]
+    if not order:
+        raise RobotError(f"{table.source} gives no link a sphere; a robot needs at least one")
+    sources = dict.fromkeys(known, "file") | rest.sources
+    return ChosenSpheres(
+        {name: table_rows[name] for name in order},
+        {name: sources[name] for name in order},
+        table.padding,
+    )
 
 
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    import yaml  # type: ignore[import-untyped]
-
-    if not path.is_file():
-        raise RobotError(f"no sphere file at '{path}'; give an existing YAML file")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RobotError(f"'{path}' is not valid YAML: {error}") from error
-    for key in ("robot_cfg", "kinematics", "collision_spheres"):
-        if isinstance(content, Mapping) and key in content:
-            content = content[key]
-    if not isinstance(content, Mapping):
-        raise RobotError(
-            f"'{path}' holds no sphere table; expected 'collision_spheres: "
-            "{link: [{center: [x, y, z], radius: r}, ...]}'"
-        )
-    return content
-
-
-def _rows(link: str, entries: Any, source: str) -> Float[np.ndarray, "n 4"]:
-    if entries is None:
-        entries = []
-    if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
-        raise RobotError(f"{source}: the spheres of '{link}' are {entries!r}; expected a list")
-    rows = np.empty((len(entries), 4))
-    for row, entry in zip(rows, entries, strict=True):
-        try:
-            row[:3] = entry["center"]
-            row[3] = entry["radius"]
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise RobotError(
-                f"{source}: a sphere of '{link}' is {entry!r}; expected "
-                "{center: [x, y, z], radius: r} in metres"
-            ) from error
-        if not np.isfinite(row).all() or row[3] <= 0:
-            raise RobotError(
-                f"{source}: a sphere of '{link}' is {entry!r}; centre and radius must be finite "
-                "and the radius positive"
-            )
-    return rows
+def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) -> ChosenSpheres:
+    """Spheres that hold the collision geometry of the URDF."""
+    rows: LinkSpheres = {}
+    sources: dict[str, str] = {}
+    for name in links:
+        link = model.links[name]
+        own = [solid for solid in link.primitives if solid.kind == "sphere"]
+        rest = [solid for solid in link.primitives if solid.kind != "sphere"]
+        parts = [enclosing_spheres(solid) for solid in own]
+        tiles = [enclosing_spheres(solid) for solid in rest]
+        if link.meshes or sum(map(len, tiles)) > _FEW_TILES:
+            surface = link_triangles(rest, link.meshes)
+            tolerance, most = fit.allowed(surface), fit.most(name, surface)
+            parts.append(fit_spheres(surface, tolerance, most))
+            sources[name] = "fitted"
+        elif tiles:
+            parts += tiles
+            sources[name] = "tiled"
+        elif own:
+            sources[name] = "urdf"
+        if parts:
+            rows[name] = np.vstack(parts)
+    return ChosenSpheres(rows, sources)
 
 
-def _from_geometry(model: RobotModel) -> LinkSpheres:
-    result: LinkSpheres = {}
-    for name, link in model.links.items():
-        if link.meshes:
-            raise RobotError(
-                f"link '{name}' has the mesh '{link.meshes[0]}' as collision geometry and no "
-                "spheres are given; pass spheres= (a YAML file or {link: [{center, radius}]}), "
-                "or use boxes, cylinders and spheres in the URDF"
-            )
-        if link.primitives:
-            result[name] = np.vstack([enclosing_spheres(solid) for solid in link.primitives])
-    if not result:
-        raise RobotError(
-            "the robot has no collision geometry; pass spheres={link: [{center, radius}]}"
-        )
-    return result
+def link_triangles(
+    solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
+) -> Float[np.ndarray, "f 3 3"]:
+    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be used.
+    """
+    parts = [solid.triangles(sides) for solid in solids] + [mesh.triangles() for mesh in meshes]
+    return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
 def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
@@ -149,8 +168,9 @@ def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
         return np.array([[*solid.T_link[:3, 3], solid.size[0] + solid.padding]])
     local = _tile_cylinder(*solid.size) if solid.kind == "cylinder" else _tile_box(solid.size)
     local[:, :3] = local[:, :3] @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
-    # Rounding in the transform must not open a gap at the corners.
-    local[:, 3] = local[:, 3] * (1.0 + 1e-9) + solid.padding
+    # Rounding must not open a gap at the corners, nor must a proof of enclosure, which sees a
+    # prism of many sides for a cylinder, find one.
+    local[:, 3] = local[:, 3] * (1.0 + 1e-3) + solid.padding
     return local
 
 

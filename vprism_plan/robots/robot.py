@@ -16,14 +16,17 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import _attached, _frames, _padding, _self_collision
+from vprism_plan.robots import _attached, _frames, _padding
 from vprism_plan.robots._arrays import KinematicArrays
+from vprism_plan.robots._build import Request, robot_fields
 from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._model import load_model
-from vprism_plan.robots._setup import choose_joints, lock_values, rigid_pose
-from vprism_plan.robots._spheres import link_spheres
-from vprism_plan.robots._srdf import SemanticModel, load_srdf
+from vprism_plan.robots._matrix import SAMPLES, srdf_text, write_srdf_text
+from vprism_plan.robots._mesh_files import MeshFile, PackageDirs
+from vprism_plan.robots._setup import rigid_pose
+from vprism_plan.robots._sphere_files import write_spheres
+from vprism_plan.robots._sphere_fit import SphereFit
 from vprism_plan.robots._torch_kinematics import TorchKinematics
+from vprism_plan.robots.report import RobotReport, robot_report
 
 if TYPE_CHECKING:
     import torch
@@ -49,11 +52,18 @@ class Robot:
         named_states: SRDF states that fix every joint of ``joint_names``.
         groups: SRDF group -> names of its links: the children of its joints and the links
             it names, with or without spheres (:meth:`links_of` gives those with spheres).
-        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's, or
-            what :meth:`attach` was told.
+        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's, a
+            generated one ("Adjacent", "Rigid", "Always", "Never"), or what :meth:`attach`
+            was told.
         arrays: The flat form that compiled kernels read.
-        links_with_meshes: Links whose collision geometry has meshes, which are not read:
-            what ``geometry`` holds of them is not the whole link.
+        links_with_meshes: Links whose collision geometry has meshes: what ``geometry``
+            holds of them is not the whole link.
+        meshes: Link name -> its collision meshes, read when they are asked for; links that
+            were scaled or padded are left out.
+        link_spheres: Link name -> (n, 4) rows (x, y, z, radius) in the link's frame: the
+            spheres as they were read or fitted, without padding, scale and attached objects.
+        sphere_sources: Link name -> where its spheres are from: "file", "urdf", "tiled"
+            over boxes and cylinders, or "fitted".
         attached: Name of each attached object -> the link that carries it.
     """
 
@@ -71,6 +81,9 @@ class Robot:
     _links: dict[str, _frames.Attachment] = field(repr=False)
     _torch: TorchKinematics = field(repr=False)
     links_with_meshes: tuple[str, ...] = ()
+    meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
+    link_spheres: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    sphere_sources: dict[str, str] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -82,18 +95,25 @@ class Robot:
         base_pose: ArrayLike | None = None,
         joints: Sequence[str] | None = None,
         locked: Mapping[str, float] | None = None,
+        *,
+        group: str | None = None,
+        package_dirs: PackageDirs = None,
+        fit: SphereFit | None = None,
+        matrix_samples: int = SAMPLES,
     ) -> Robot:
         """Read a robot.
 
         Args:
             path: The URDF (xacro expanded).
-            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is
-                one. Without an SRDF, only links joined by a joint and links whose
-                spheres always overlap are left out of self-collision.
+            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is one.
+                Without an SRDF, ``disabled_pairs`` is generated: links joined by a joint or
+                rigid to each other, links whose spheres always overlap, and links that
+                stay far apart, both judged by ``matrix_samples`` random configurations.
             spheres: Collision spheres: a YAML file (``collision_spheres: {link:
-                [{center: [x, y, z], radius: r}]}``), such a mapping, or None:
-                ``<stem>_spheres.yml`` beside the URDF, else spheres that enclose
-                the URDF's own boxes, cylinders and spheres.
+                [{center: [x, y, z], radius: r}]}``), a robot file of cuRobo, an XRDF file,
+                such content as a mapping, or None: ``<stem>_spheres.yml`` beside the URDF,
+                else spheres that enclose the URDF's own geometry (spheres are taken as
+                they are). "fit" does so in any case.
             base_pose: (4, 4) pose of the root link in the world; None is identity.
             joints: Joints of a configuration, in the order wanted. None takes the
                 SRDF group "arm" if there is one, else all joints that move and do
@@ -101,47 +121,33 @@ class Robot:
             locked: Values for joints not in ``joints``. Default for each: its value
                 in the SRDF (state "ready" first, then file order), else 0 or the
                 limit next to it.
+            group: Instead of ``joints``: an SRDF group, whose joints are taken.
+            package_dirs: Where ``package://NAME/...`` leads to: folders that hold packages,
+                or a mapping from a name to its folder. ROS_PACKAGE_PATH, AMENT_PREFIX_PATH
+                and the folders above the URDF are searched in any case.
+            fit: How spheres are fitted; None: as :class:`SphereFit` has it.
+            matrix_samples: For the pairs that are generated.
 
         Raises:
             RobotError: Something above is malformed or does not fit together; the
                 message names it.
         """
-        path = Path(path)
-        model = load_model(path)
-        beside = path.with_suffix(".srdf")
-        srdf = beside if srdf is None and beside.is_file() else srdf
-        semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
-        active = choose_joints(model, semantics, joints)
-        fixed_values = lock_values(model, semantics, active, locked or {})
-        base = rigid_pose(np.eye(4) if base_pose is None else base_pose)
-        balls = link_spheres(model, path, spheres)
-        nothing = np.empty((0, 2), dtype=np.int64)
-        arrays, links = _frames.build_arrays(model, active, fixed_values, balls, nothing, base)
-        pairs = _self_collision.candidate_pairs(model, links, tuple(balls), semantics.disabled)
-        if srdf is None:
-            pairs = _self_collision.drop_always_touching(arrays, pairs, tuple(balls))
-        arrays = dataclasses.replace(arrays, pairs=pairs)
-        states = {
-            name: np.array([values[joint] for joint in active])
-            for name, values in semantics.merged_states().items()
-            if all(joint in values for joint in active)
-        }
-        return cls(
-            name=model.name,
-            joint_names=active,
-            locked=fixed_values,
-            velocity_limits=np.array([model.joint_map[j].velocity for j in active]),
-            base_pose=base,
-            link_names=tuple(balls),
-            geometry={n: link.primitives for n, link in model.links.items() if link.primitives},
-            named_states=states,
-            groups=dict(semantics.group_links),
-            disabled_pairs=dict(semantics.disabled),
-            arrays=arrays,
-            _links=links,
-            _torch=TorchKinematics(arrays),
-            links_with_meshes=tuple(n for n, link in model.links.items() if link.meshes),
+        fields, padding = robot_fields(
+            Request(
+                Path(path),
+                srdf,
+                spheres,
+                base_pose,
+                joints,
+                group,
+                locked or {},
+                package_dirs,
+                fit or SphereFit(),
+                matrix_samples,
+            )
         )
+        robot = cls(**fields)
+        return robot.with_padding(padding) if padding else robot
 
     @property
     def dof(self) -> int:
@@ -385,6 +391,39 @@ class Robot:
             RobotError: Nothing of that name is attached, or something is attached to it.
         """
         return _attached.detached(self, name)
+
+    def report(self) -> RobotReport:
+        """Compare the spheres with the geometry of the URDF, and list what is not tested.
+
+        For every link: whether its spheres hold it (proved), how much of it, and how far
+        they stand out. Takes a second or so for an arm. Padding, scale and attached
+        objects do not enter.
+
+        Raises:
+            RobotError: A mesh file cannot be read; missing ones are reported as such.
+        """
+        return robot_report(self)
+
+    def write_spheres(self, path: str | Path) -> None:
+        """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is
+        read from then on, which spares the fit. Reading gives the same numbers, bit by bit.
+        """
+        bare = {name: np.empty((0, 4)) for name in (*self.geometry, *self.links_with_meshes)}
+        note = f"Collision spheres of {self.name}, metres, in link frames."
+        write_spheres(path, bare | self.link_spheres, note)
+
+    def write_srdf(self, path: str | Path) -> None:
+        """Write an SRDF: the configuration's joints as group "arm", other groups, named
+        states, the values of locked joints, and every disabled pair with its reason.
+        """
+        states = {
+            name: dict(zip(self.joint_names, map(float, q), strict=True))
+            for name, q in self.named_states.items()
+        }
+        of_urdf = {p: why for p, why in self.disabled_pairs.items() if not p & set(self.attached)}
+        write_srdf_text(
+            path, srdf_text(self.name, self.joint_names, self.groups, states, self.locked, of_urdf)
+        )
 
     def _expected(self, opening: str) -> str:
         return f"{opening}{self.dof},) for the joints {list(self.joint_names)}"

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Files of collision spheres: this package's YAML, cuRobo's, and XRDF."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan._files import write_text
+from vprism_plan.errors import RobotError
+
+LinkSpheres = dict[str, np.ndarray]
+"""Link name -> (n, 4) rows (x, y, z, radius) in the link's frame, metres."""
+
+_EXPECTED = "'collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}'"
+
+
+@dataclass(frozen=True)
+class SphereTable:
+    """What a file or a mapping says of spheres.
+
+    Attributes:
+        source: For messages.
+        spheres: Spheres by link, those that are switched off left out; a link may have none.
+        padding: Metres by which links' spheres are to grow against the world.
+        foreign: Whether another program's file: links that it leaves out are then fitted,
+            and links it adds are passed over if they have no spheres.
+    """
+
+    source: str
+    spheres: LinkSpheres
+    padding: dict[str, float] = field(default_factory=dict)
+    foreign: bool = False
+
+
+def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
+    """Read collision spheres.
+
+    Understood are
+
+    - ``collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}``, or the inner
+      mapping by itself, which ``write_spheres`` writes;
+    - cuRobo's robot files, with ``robot_cfg: kinematics: collision_spheres`` as the name of
+      a file beside it or inline, and its files of spheres alone (with a key ``robot``).
+      A radius of 0 or below switches a sphere off; ``collision_sphere_buffer`` is padding;
+    - XRDF: the spheres of the geometry that ``collision`` names, radii of 0 or below off;
+      its ``buffer_distance`` is padding.
+
+    Padding below 0 would shrink links and is not applied.
+
+    Args:
+        spheres: A YAML or XRDF file, or its content as a mapping.
+
+    Raises:
+        RobotError: There is no such file, it is none of the above, or a sphere is malformed.
+    """
+    if isinstance(spheres, str | Path):
+        path = Path(spheres)
+        source, content, folder = f"'{path}'", _yaml(path), path.parent
+    else:
+        source, content, folder = "spheres", spheres, Path()
+    if isinstance(content, Mapping) and content.get("format") == "xrdf":
+        return _from_xrdf(content, source)
+    kinematics = content
+    for key in ("robot_cfg", "kinematics"):
+        if isinstance(kinematics, Mapping) and key in kinematics:
+            kinematics = kinematics[key]
+    if kinematics is not content:
+        return _from_curobo(kinematics, source, folder)
+    alone = isinstance(content, Mapping) and "robot" in content
+    return SphereTable(source, _table(content, source, off=alone), foreign=alone)
+
+
+def _yaml(path: Path) -> Any:
+    import yaml  # type: ignore[import-untyped]
+
+    if not path.is_file():
+        raise RobotError(f"no sphere file at '{path}'; give an existing YAML or XRDF file")
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise RobotError(f"'{path}' is not valid YAML: {error}") from error
+
+
+def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
+    entry = kinematics.get("collision_spheres") if isinstance(kinematics, Mapping) else None
+    if isinstance(entry, str):
+        path = folder / entry
+        if not path.is_file():
+            raise RobotError(
+                f"{source} takes its spheres from '{entry}', and there is no file '{path}'; put "
+                "it there, or give that file itself"
+            )
+        named = f"'{path}'"
+        spheres = _table(_yaml(path), named, off=True)
+    else:
+        spheres = _table(entry, source, off=True)
+    buffer = kinematics.get("collision_sphere_buffer")
+    return SphereTable(source, spheres, _padding(buffer, spheres, source), foreign=True)
+
+
+def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
+    geometries = content.get("geometry")
+    if not isinstance(geometries, Mapping) or not geometries:
+        raise RobotError(f"{source} is XRDF without a 'geometry' section; it holds no spheres")
+    # Version 2 renamed the section.
+    section = content.get("collision") or content.get("world_collision") or {}
+    name = section.get("geometry") if isinstance(section, Mapping) else None
+    if name is None and len(geometries) == 1:
+        name = next(iter(geometries))
+    chosen = geometries.get(name)
+    if not isinstance(chosen, Mapping) or "spheres" not in chosen:
+        raise RobotError(
+            f"{source}: the section 'collision' names the geometry {name!r}, which has no spheres; "
+            f"geometries: {sorted(map(str, geometries))}"
+        )
+    spheres = _table(chosen["spheres"], source, off=True)
+    padding = _padding(section.get("buffer_distance"), spheres, source)
+    return SphereTable(source, spheres, padding, foreign=True)
+
+
+def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]:
+    table = buffer if isinstance(buffer, Mapping) else dict.fromkeys(spheres, buffer or 0.0)
+    padding = {}
+    for link, value in table.items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError) as error:
+            raise RobotError(
+                f"{source}: the buffer of link '{link}' is {value!r}; it must be metres"
+            ) from error
+        if not math.isfinite(number):
+            raise RobotError(f"{source}: the buffer of link '{link}' is {value!r}; write metres")
+        if number > 0.0 and len(spheres.get(link, ())):
+            padding[str(link)] = number
+    return padding
+
+
+def _table(content: Any, source: str, off: bool) -> LinkSpheres:
+    if isinstance(content, Mapping) and "collision_spheres" in content:
+        content = content["collision_spheres"]
+    if not isinstance(content, Mapping):
+        raise RobotError(f"{source} holds no sphere table; expected {_EXPECTED}")
+    return {str(link): _rows(link, entries, source, off) for link, entries in content.items()}
+
+
+def _rows(link: str, entries: Any, source: str, off: bool) -> Float[np.ndarray, "n 4"]:
+    if entries is None:
+        entries = []
+    if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
+        raise RobotError(f"{source}: the spheres of '{link}' are {entries!r}; expected a list")
+    rows = np.empty((len(entries), 4))
+    for row, entry in zip(rows, entries, strict=True):
+        try:
+            row[:3] = entry["center"]
+            row[3] = entry["radius"]
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise RobotError(
+                f"{source}: a sphere of '{link}' is {entry!r}; expected "
+                "{center: [x, y, z], radius: r} in metres"
+            ) from error
+        if not np.isfinite(row).all() or (row[3] <= 0 and not off):
+            raise RobotError(
+                f"{source}: a sphere of '{link}' is {entry!r}; centre and radius must be finite "
+                "and the radius positive"
+            )
+    return rows[rows[:, 3] > 0.0]
+
+
+def write_spheres(
+    path: str | Path, spheres: Mapping[str, Float[np.ndarray, "n 4"]], note: str = ""
+) -> None:
+    """Write spheres as YAML that :func:`read_spheres` reads back bit by bit.
+
+    Args:
+        path: The file.
+        spheres: Link -> (n, 4) rows (x, y, z, radius), link frame, metres.
+        note: Lines for a comment at the top.
+    """
+    lines = [f"# {line}".rstrip() for line in note.splitlines()]
+    lines.append("collision_spheres:")
+    for link, rows in spheres.items():
+        lines.append(f"  {_key(link)}:" + ("" if len(rows) else " []"))
+        for row in rows:
+            x, y, z, radius = (_number(float(value)) for value in row)
+            lines.append(f"    - {{center: [{x}, {y}, {z}], radius: {radius}}}")
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def _number(value: float) -> str:
+    """Shortest text that gives the same number, with the dot that YAML 1.1 asks for."""
+    text = repr(value)
+    mantissa, mark, exponent = text.partition("e")
+    return text if "." in mantissa else f"{mantissa}.0{mark}{exponent}"
+
+
+def _key(link: str) -> str:
+    """A link's name as a YAML key; quoted where it could be read as something else."""
+    plain = link.isidentifier() and link.lower() not in {"y", "n", "yes", "no", "on", "off"}
+    return link if plain and link.lower() not in {"true", "false", "null"} else f'"{link}"'

@@ -1,0 +1,358 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Few spheres that hold a link: its surface triangle by triangle, and what is inside it.
+
+A sphere of radius ``r`` whose centre lies ``a`` deep in a solid stands out of it by ``r - a``
+at most; one whose centre lies ``b`` outside, by ``r + b``. With the signed distance ``s`` to
+the surface, both are ``r + s(centre)``: the figure to keep small. The surface is cut into
+small triangles, each of which must lie in one sphere with all its corners (a ball is convex,
+so with all of itself). Three steps, all without chance:
+
+1. A greedy choice among centres inside the link, for the smallest ``r + s`` by bisection.
+2. In turns, each triangle goes to the sphere that stands out least by holding it, and each
+   sphere moves to where it stands out least while it holds its triangles (Lloyd's
+   iteration, for the largest figure instead of the mean).
+3. The radii shrink to what is needed; spheres that nothing needs are dropped.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from vprism_plan.errors import RobotError
+from vprism_plan.robots._mesh_spheres import candidate_cells, greedy_cover
+
+# Lattice cells along the longest edge of a link's box.
+_CELLS = 18
+# Longest edge of the triangles that spheres hold, in cells.
+_EDGE = 1.5
+_MOST, _ARM_SIZED = 12, 0.35
+_CENTRES = 400
+_ROUNDS = 30
+# Relative and absolute (metres): what rounding may take away from a radius.
+_SLACK, _HAIR = 1e-9, 1e-9
+_STEPS = np.array(
+    [[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.float64
+)
+_STEPS /= np.maximum(np.linalg.norm(_STEPS, axis=1, keepdims=True), 1.0)
+
+
+@dataclass(frozen=True)
+class SphereFit:
+    """How spheres are fitted to links that have none.
+
+    Of each link the fewest spheres are taken that stand out by no more than the tolerance,
+    and where ``max_spheres`` do not suffice, so many, which stand out as little as they can.
+
+    Attributes:
+        tolerance: Metres by which a sphere may stand out of its link.
+        relative: The same as a share of the diagonal of the link's box; the smaller of the
+            two counts, so that fingers are not drowned.
+        max_spheres: At most so many for each link: one number, or a table by link. None, and
+            links that the table leaves out: 12, and for links whose box has a diagonal above
+            0.35 m so many more as their surface is larger, 64 at most.
+
+    Raises:
+        RobotError: A value is not positive.
+    """
+
+    tolerance: float = 0.03
+    relative: float = 0.15
+    max_spheres: int | Mapping[str, int] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "relative"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise RobotError(f"{name} is {value!r}; it must be finite and above 0")
+        table = self.max_spheres
+        for most in table.values() if isinstance(table, Mapping) else [table]:
+            if most is not None and most < 1:
+                raise RobotError(f"max_spheres is {most}; every link needs at least 1")
+
+    def most(self, link: str, triangles: Float[np.ndarray, "f 3 3"]) -> int:
+        """Return the largest number of spheres for a link with this surface."""
+        table = self.max_spheres
+        most = table.get(link) if isinstance(table, Mapping) else table
+        if most is not None:
+            return int(most)
+        return min(64, max(_MOST, math.ceil(_MOST * (_diagonal(triangles) / _ARM_SIZED) ** 2)))
+
+    def allowed(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:
+        """Return the metres by which a sphere may stand out of these triangles."""
+        return min(self.tolerance, self.relative * _diagonal(triangles))
+
+
+def _diagonal(triangles: Float[np.ndarray, "f 3 3"]) -> float:
+    return float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
+
+
+def fit_spheres(
+    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int
+) -> Float[np.ndarray, "n 4"]:
+    """Spheres whose union holds a surface, and what it encloses.
+
+    Of the inside, the cells of a lattice (an 18th of the longest edge) are held that the
+    surface does not reach; what is left lies within two cells of the surface.
+
+    Args:
+        triangles: (f, 3, 3) corners, metres; closed or not, in one piece or many.
+        tolerance: Metres by which spheres may stand out if `max_spheres` suffice for it.
+        max_spheres: At most so many (a hollow that they leave is filled beyond that, by
+            spheres that do not stand out).
+
+    Returns:
+        (n, 4) rows (x, y, z, radius), metres; the same for equal arguments.
+    """
+    corners = np.ascontiguousarray(triangles, dtype=np.float64)
+    return _fit(corners.tobytes(), tolerance, max_spheres).copy()
+
+
+# The wheels, fingers and arms of a robot are often alike.
+@lru_cache(maxsize=256)
+def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
+    surface = _Surface.of(np.frombuffer(corners).reshape(-1, 3, 3))
+    index = np.argwhere(surface.filled)
+    centres = surface.lower + surface.cell * (index + 0.5)
+    depth = -surface.lattice[tuple(index.T)]
+    chosen = candidate_cells(depth, _CENTRES)
+    centres, depth = centres[chosen], depth[chosen]
+    reach = surface.reach(centres).astype(np.float32) * np.float32(1.0 + 1e-6)
+    # Moving the spheres afterwards gains about a fifth.
+    first = greedy_cover(reach, depth + 1.25 * tolerance, max_spheres)
+    count = max_spheres if first is None else len(first)
+    while True:
+        start = _smallest(reach, depth, count)
+        spheres, protrusion = _settled(surface, centres[start])
+        if protrusion <= tolerance or count >= max_spheres:
+            break
+        count = min(max_spheres, count + max(1, count // 4))
+    return _filled_up(surface, spheres)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Small triangles, and a lattice of signed distances to them.
+
+    Attributes:
+        points: (v, 3) corners, each once.
+        faces: (t, 3) indices into them.
+        lower: outer corner of the lattice's first cell.
+        cell: edge of a cell.
+        filled: cells with surface in them or enclosed by such cells.
+        inner: those without a corner.
+        whole: those that no surface reaches: they lie inside.
+        lattice: signed distance at the cells' centres, to within half a cell.
+    """
+
+    points: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "t 3"]
+    lower: Float[np.ndarray, "3"]
+    cell: float
+    filled: Bool[np.ndarray, "x y z"]
+    inner: Bool[np.ndarray, "x y z"]
+    whole: Bool[np.ndarray, "x y z"]
+    lattice: Float[np.ndarray, "x y z"] = field(repr=False)
+
+    @classmethod
+    def of(cls, triangles: Float[np.ndarray, "f 3 3"]) -> _Surface:
+        from scipy import ndimage
+        from scipy.spatial import cKDTree
+
+        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+        cell = float((high - low).max()) / _CELLS
+        points, faces = _merged(split_triangles(triangles, _EDGE * cell))
+        # No path from cell to cell passes between corners so near to each other.
+        small = split_triangles(points[faces], 0.8 * cell)
+        dense, _ = _merged(small)
+        lower = low - 1.5 * cell
+        touched = np.zeros(tuple(np.ceil((high - low) / cell + 3.0).astype(np.int64)), dtype=bool)
+        touched[tuple(np.floor((dense - lower) / cell).astype(np.int64).T)] = True
+        filled = np.asarray(ndimage.binary_fill_holes(touched))
+        inner = filled & ~touched
+        # A triangle reaches into no other cells than those of its box's corners.
+        ends = np.floor((np.stack([small.min(axis=1), small.max(axis=1)]) - lower) / cell)
+        for corner in np.ndindex(2, 2, 2):
+            touched[tuple(ends[corner, :, [0, 1, 2]].astype(np.int64))] = True
+        whole = filled & ~touched
+        middles = lower + cell * (np.argwhere(np.ones_like(filled)) + 0.5)
+        distance = np.asarray(cKDTree(dense).query(middles)[0]).reshape(filled.shape)
+        lattice = np.where(inner, -distance, distance)
+        return cls(points, faces, lower, cell, filled, inner, whole, lattice)
+
+    def reach(self, centres: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c t"]:
+        """Distance from each centre to the farthest corner of each triangle."""
+        from scipy.spatial.distance import cdist
+
+        away = cdist(centres, self.points)
+        return np.asarray(
+            np.maximum(
+                np.maximum(away[:, self.faces[:, 0]], away[:, self.faces[:, 1]]),
+                away[:, self.faces[:, 2]],
+            )
+        )
+
+    def signed(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Signed distance, interpolated between cells; negative inside."""
+        from scipy.ndimage import map_coordinates
+
+        at = (x - self.lower) / self.cell - 0.5
+        return np.asarray(map_coordinates(self.lattice, at.T, order=1, mode="nearest"))
+
+
+def _merged(
+    triangles: Float[np.ndarray, "t 3 3"],
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
+    """Corners, each once, and the triangles' indices into them."""
+    flat = triangles.reshape(-1, 3)
+    # As bytes, which sort faster than rows; 0.0 + x turns -0.0 into 0.0.
+    keys = np.ascontiguousarray(0.0 + flat).view(np.dtype((np.void, 24))).ravel()
+    _, which, faces = np.unique(keys, return_index=True, return_inverse=True)
+    return flat[which], faces.reshape(-1, 3)
+
+
+def split_triangles(
+    triangles: Float[np.ndarray, "f 3 3"], longest: float
+) -> Float[np.ndarray, "t 3 3"]:
+    """The same surface in triangles with no edge longer than `longest`, metres."""
+    done = []
+    while len(triangles):
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        small = edges.max(axis=1) <= longest
+        done.append(triangles[small])
+        triangles = halved_triangles(triangles[~small], edges[~small])
+    return np.concatenate(done)
+
+
+def halved_triangles(
+    triangles: Float[np.ndarray, "f 3 3"], edges: Float[np.ndarray, "f 3"]
+) -> Float[np.ndarray, "t 3 3"]:
+    """Each triangle as two, cut from the middle of its longest edge."""
+    rows, start = np.arange(len(triangles)), edges.argmax(axis=1)
+    a, b, c = (triangles[rows, (start + k) % 3] for k in range(3))
+    middle = 0.5 * (a + b)
+    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+
+
+def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> list[int]:
+    """Centres of at most `count` spheres that hold all and stand out least, by bisection."""
+    alone = reach.max(axis=1) - depth
+    best, low, high = [int(alone.argmin())], 0.0, float(alone.min())
+    for _ in range(7):
+        middle = 0.5 * (low + high)
+        found = greedy_cover(reach, depth + middle, count)
+        if found is None:
+            low = middle
+        else:
+            best, high = [which for which, _ in found], middle
+    return best
+
+
+def _settled(
+    surface: _Surface, centres: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 4"], float]:
+    """Move spheres until their largest protrusion stands still; return it, too."""
+    centres = centres.copy()
+    reach = surface.reach(centres)
+    before, still = math.inf, 0
+    for _ in range(_ROUNDS):
+        cost = reach + surface.signed(centres)[:, None]
+        owner, worst = cost.argmin(axis=0), float(cost.min(axis=0).max())
+        still = still + 1 if before - worst < 1e-3 * worst else 0
+        if still > 2:
+            break
+        before = worst
+        for i in range(len(centres)):
+            own = np.flatnonzero(owner == i)
+            if len(own):
+                centres[i] = _moved(surface, centres[i], own)
+                reach[i] = surface.reach(centres[i : i + 1])[0]
+    cost = reach + surface.signed(centres)[:, None]
+    radius = cost.min(axis=0).max() - surface.signed(centres)
+    return _tightened(surface, centres, reach, radius)
+
+
+def _moved(
+    surface: _Surface, centre: Float[np.ndarray, "3"], own: Int[np.ndarray, "k"]
+) -> Float[np.ndarray, "3"]:
+    """Where a sphere that holds these triangles stands out least, by a pattern search."""
+    from scipy.spatial.distance import cdist
+
+    points = surface.points[np.unique(surface.faces[own])]
+
+    def cost(x: np.ndarray) -> np.ndarray:
+        return np.sqrt(cdist(x, points, "sqeuclidean").max(axis=1)) + surface.signed(x)
+
+    best = float(cost(centre[None])[0])
+    step = 0.3 * float(np.linalg.norm(points - centre, axis=1).max())
+    for _ in range(10):
+        around = centre + step * _STEPS
+        values = cost(around)
+        least = int(values.argmin())
+        if values[least] < best - 1e-6:
+            best, centre = float(values[least]), around[least]
+        else:
+            step *= 0.5
+    return centre
+
+
+def _tightened(
+    surface: _Surface,
+    centres: Float[np.ndarray, "n 3"],
+    reach: Float[np.ndarray, "n t"],
+    radius: Float[np.ndarray, "n"],
+) -> tuple[Float[np.ndarray, "n 4"], float]:
+    """Cut every radius to what no other sphere holds, worst first."""
+    centres, reach, radius = centres.copy(), reach.copy(), radius.copy()
+    kept = np.ones(len(centres), dtype=bool)
+    holds = reach <= radius[:, None] * (1.0 + _SLACK)
+    for i in np.argsort(-(radius + surface.signed(centres)), kind="stable"):
+        kept[i] = False
+        own = np.flatnonzero(~holds[kept].any(axis=0))
+        if len(own) == 0:
+            continue
+        kept[i] = True
+        centres[i] = _moved(surface, centres[i], own)
+        reach[i] = surface.reach(centres[i : i + 1])[0]
+        radius[i] = reach[i, own].max() * (1.0 + _SLACK) + _HAIR
+        holds[i] = reach[i] <= radius[i]
+    spheres = np.column_stack([centres[kept], radius[kept]])
+    return spheres, float((radius + surface.signed(centres))[kept].max())
+
+
+def _filled_up(surface: _Surface, spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 4"]:
+    """Add spheres inside until every cell that no surface reaches is held."""
+    index = np.argwhere(surface.whole)
+    middles = surface.lower + surface.cell * (index + 0.5)
+    depth = -surface.lattice[tuple(index.T)]
+    half = 0.5 * math.sqrt(3.0) * surface.cell
+    while True:
+        gap = np.linalg.norm(middles[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
+        open_cells = gap.min(axis=1) > -half
+        open_cells[open_cells] = ~_cells_held(middles[open_cells], surface.cell, spheres)
+        if not open_cells.any():
+            return spheres
+        deepest = int(np.argmax(np.where(open_cells, depth, -np.inf)))
+        radius = max(float(depth[deepest]), half)
+        spheres = np.vstack([spheres, [*middles[deepest], radius * (1.0 + _SLACK)]])
+
+
+def _cells_held(
+    middles: Float[np.ndarray, "n 3"], edge: float, spheres: Float[np.ndarray, "m 4"], deep: int = 3
+) -> Bool[np.ndarray, "n"]:
+    """Whether cubes lie in the union of spheres: each, or each of its eighths, in one."""
+    offsets = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+    if len(middles) == 0:
+        return np.zeros(0, dtype=bool)
+    corners = middles[:, None] + edge * offsets
+    away = np.linalg.norm(corners[:, :, None] - spheres[None, None, :, :3], axis=3)
+    held = (away <= spheres[:, 3]).all(axis=1).any(axis=1)
+    if deep and not held.all():
+        parts = (middles[~held][:, None] + 0.5 * edge * offsets).reshape(-1, 3)
+        held[~held] = _cells_held(parts, 0.5 * edge, spheres, deep - 1).reshape(-1, 8).all(axis=1)
+    return np.asarray(held)
