@@ -187,6 +187,43 @@ class View:
 
 
 @dataclass(frozen=True)
+class RobotInfo:
+    """Show what a URDF becomes: joints, collision spheres, pairs of links that are not tested.
+
+    Spheres come from --spheres, else from STEM_spheres.yml beside the URDF, else they are fitted
+    to its collision geometry. The table says of each link whether they enclose it (proved) and
+    how far they stand out of it.
+    """
+
+    urdf: Positional[Path]
+    """The robot description (xacro expanded)."""
+    srdf: Annotated[Path | None, arg(metavar="SRDF")] = None
+    """Groups, states and pairs not to test; default STEM.srdf beside the URDF, else pairs are
+    generated from random configurations."""
+    spheres: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Collision spheres: YAML of this package or of cuRobo, or XRDF."""
+    fit: bool = False
+    """Fit spheres even if there is a file of them beside the URDF."""
+    tolerance: float = 0.03
+    """How far fitted spheres may stand out of a link (m), where --max-spheres suffice for it."""
+    max_spheres: Annotated[int | None, arg(metavar="INT")] = None
+    """At most so many fitted spheres for each link; default 12, more for links above 0.35 m."""
+    group: Annotated[str | None, arg(metavar="NAME")] = None
+    """SRDF group whose joints make a configuration; default "arm", else all joints."""
+    package_dirs: Annotated[tuple[Path, ...], arg(metavar="DIR ...")] = ()
+    """Folders that hold the packages of package:// names; folders above the URDF and
+    ROS_PACKAGE_PATH, AMENT_PREFIX_PATH are searched in any case."""
+    spheres_output: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Write the spheres as YAML: as STEM_spheres.yml beside the URDF they are read from then on."""
+    srdf_output: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Write an SRDF with the joints as group "arm" and the pairs that are not tested."""
+    picture: Annotated[Path | None, arg(metavar="PNG")] = None
+    """Write a picture: the collision geometry, and the spheres over it."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+@dataclass(frozen=True)
 class Eval:
     """Compare methods or checkers on generated scenes whose truth is known; write a report.
 
@@ -223,7 +260,7 @@ class Eval:
     """Print one JSON object instead of text."""
 
 
-Command = Demo | Map | Plan | Query | Mesh | View | Eval
+Command = Demo | Map | Plan | Query | Mesh | View | RobotInfo | Eval
 CommandLine = AvoidSubcommands[
     Annotated[Demo, subcommand("demo")]
     | Annotated[Map, subcommand("map")]
@@ -231,5 +268,6 @@ CommandLine = AvoidSubcommands[
     | Annotated[Query, subcommand("query")]
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[View, subcommand("view")]
+    | Annotated[RobotInfo, subcommand("robot")]
     | Annotated[Eval, subcommand("eval")]
 ]

@@ -20,7 +20,7 @@ from vprism_plan.robots import _attached, _frames, _padding
 from vprism_plan.robots._arrays import KinematicArrays
 from vprism_plan.robots._build import Request, robot_fields
 from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._matrix import SAMPLES, srdf_text, write_srdf_text
+from vprism_plan.robots._matrix import SAMPLES, shares_touching, srdf_text, write_srdf_text
 from vprism_plan.robots._mesh_files import MeshFile, PackageDirs
 from vprism_plan.robots._setup import rigid_pose
 from vprism_plan.robots._sphere_files import write_spheres
@@ -403,6 +403,26 @@ class Robot:
             RobotError: A mesh file cannot be read; missing ones are reported as such.
         """
         return robot_report(self)
+
+    def touching_shares(self, samples: int = 500, seed: int = 0) -> dict[frozenset[str], float]:
+        """How often tested pairs of links overlap in random configurations.
+
+        Where spheres are coarse, or a locked joint stands badly, a pair can refuse most of
+        them.
+
+        Args:
+            samples: Uniform configurations within the limits.
+            seed: Of these.
+
+        Returns:
+            Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
+        """
+        shares, _ = shares_touching(self.arrays, self.collision_pairs, samples, seed)
+        names = self.link_names
+        return {
+            frozenset((names[a], names[b])): float(share)
+            for (a, b), share in zip(self.collision_pairs, shares, strict=True)
+        }
 
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is

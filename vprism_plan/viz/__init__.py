@@ -6,6 +6,7 @@ from vprism_plan.viz.map_plot import map_figure
 from vprism_plan.viz.margin_plot import margin_figure
 from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample, sphere_centers
 from vprism_plan.viz.risk_plot import risk_figure
+from vprism_plan.viz.robot_plot import robot_figure
 from vprism_plan.viz.scene_plot import scene_figure
 from vprism_plan.viz.trajopt_plot import trajopt_figure
 
@@ -17,6 +18,7 @@ __all__ = [
     "plan_figure",
     "resample",
     "risk_figure",
+    "robot_figure",
     "save_figure",
     "scene_figure",
     "sphere_centers",
