@@ -308,7 +308,9 @@ def test_a_malformed_query_names_the_value(arguments, message):
     (START, [0.0, 0.0, 0.0], r"goal has shape \(3,\)"),
     ([np.nan, 0.0], GOAL, "start is .*nan.*finite"),
     (START, [0.0, np.inf], "goal is .*inf.*finite"),
-    (START, [START, GOAL], r"goal has shape \(2, 2\)"),
+    (START, np.zeros((2, 3)), r"goal has shape \(2, 3\)"),
+    (START, [START, [np.nan, 0.0]], "goal 1 is .*nan.*finite"),
+    (START, np.zeros((0, 2)), r"goal has shape \(0, 2\)"),
 ])  # fmt: skip
 def test_what_is_not_a_configuration_is_an_error(start, goal, message):
     with pytest.raises(PlanningError, match=message):

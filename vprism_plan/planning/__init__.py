@@ -11,6 +11,7 @@ from vprism_plan.planning._spaces import state_space as state_space
 from vprism_plan.planning._spaces import to_array as to_array
 from vprism_plan.planning._spaces import to_state as to_state
 from vprism_plan.planning.goals import PoseGoalConfig as PoseGoalConfig
+from vprism_plan.planning.goals import ReachRegion as ReachRegion
 from vprism_plan.planning.objectives import PathCost as PathCost
 from vprism_plan.planning.objectives import RiskObjective as RiskObjective
 from vprism_plan.planning.objectives import (
@@ -26,7 +27,9 @@ from vprism_plan.planning.planner import plan as plan
 from vprism_plan.planning.result import Improvement as Improvement
 from vprism_plan.planning.result import PlanReport as PlanReport
 from vprism_plan.planning.result import PlanResult as PlanResult
+from vprism_plan.planning.result import RefusedGoal as RefusedGoal
 from vprism_plan.planning.trajectory import Trajectory as Trajectory
 from vprism_plan.planning.trajectory import time_parameterize as time_parameterize
 from vprism_plan.planning.trajectory_io import read_trajectory as read_trajectory
 from vprism_plan.planning.trajectory_io import write_trajectory as write_trajectory
+from vprism_plan.planning.widest import plan_widest as plan_widest

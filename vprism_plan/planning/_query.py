@@ -15,8 +15,14 @@ from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._runtime import checked_seed
 from vprism_plan.planning._search import SearchRequest
 from vprism_plan.planning._verify import one_line
-from vprism_plan.planning.goals import PoseGoalConfig, configurations_at_pose
-from vprism_plan.planning.result import PlanReport, PlanResult
+from vprism_plan.planning.goals import (
+    GoalSolutions,
+    PoseGoalConfig,
+    ReachRegion,
+    solve_pose,
+    solve_region,
+)
+from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
 
 
 def search_request(
@@ -110,31 +116,67 @@ def valid_goals(
     start: Float[np.ndarray, " dof"],
     pose_goal: PoseGoalConfig,
     report: PlanReport,
-) -> np.ndarray | PlanResult:
-    """Return valid goal configurations (g, dof), or the refusal."""
+) -> tuple[Float[np.ndarray, "g dof"], PlanReport] | PlanResult:
+    """Return valid goal configurations (g, dof) and the report of the others, or the refusal."""
+    robot = checker.robot
+    if isinstance(goal, ReachRegion):
+        found = solve_region(robot, goal, start, report.seed, pose_goal)
+        return _accepted(checker, found, "region", pose_goal, report)
     array = np.asarray(goal, dtype=np.float64)
-    if array.shape != (4, 4):
-        q = configuration(array, checker.robot, "goal")
-        refusal = refuse(checker, q, "goal", report)
-        return q[None] if refusal is None else refusal
-    found = configurations_at_pose(checker, array, start, report.seed, pose_goal)
-    if len(found.valid):
-        return found.valid
-    if found.example is None:
+    if array.shape == (4, 4) and (robot.dof != 4 or array[3].tolist() == [0.0, 0.0, 0.0, 1.0]):
+        found = solve_pose(robot, array, start, report.seed, pose_goal)
+        return _accepted(checker, found, "pose", pose_goal, report)
+    if array.ndim == 2 and len(array) > 0 and array.shape[1] == robot.dof:
+        rows = np.stack([configuration(q, robot, f"goal {k}") for k, q in enumerate(array)])
+        return _accepted(checker, GoalSolutions(rows, len(rows)), "", pose_goal, report)
+    q = configuration(array, robot, "goal")
+    refusal = refuse(checker, q, "goal", report)
+    return (q[None], report) if refusal is None else refusal
+
+
+def _accepted(
+    checker: CheckerLike,
+    found: GoalSolutions,
+    what: str,
+    pose_goal: PoseGoalConfig,
+    report: PlanReport,
+) -> tuple[Float[np.ndarray, "g dof"], PlanReport] | PlanResult:
+    """Keep what the checker accepts and note why it refuses the others.
+
+    what: "pose", "region", or "" for configurations that the caller gave, all of which are
+    kept if they are valid.
+    """
+    if len(found.reached) == 0:
         return PlanResult(
             path=None,
             status="invalid_goal",
             report=report,
-            message="goal is invalid: no configuration within the joint limits reaches the pose "
-            f"({found.attempts} attempts)",
+            message="goal is invalid: no configuration within the joint limits reaches the "
+            f"{what} ({found.attempts} attempts)",
         )
-    refusal = refuse(checker, found.example, "goal", report)
-    if refusal is None:
-        raise PlanningError("the checker changed its verdict on a goal configuration")
+    good: list[np.ndarray] = []
+    refused: list[PlanResult] = []
+    notes: list[RefusedGoal] = []
+    most = pose_goal.max_goals if what else len(found.reached)
+    for q in found.reached:
+        refusal = refuse(checker, q, "goal", report)
+        if refusal is None:
+            good.append(q)
+        else:
+            refused.append(refusal)
+            reason = refusal.message.removeprefix("goal is invalid: ")
+            notes.append(RefusedGoal(tuple(q.tolist()), reason))
+        if len(good) == most:
+            break
+    report = replace(report, refused_goals=tuple(notes))
+    if good:
+        return np.array(good), report
+    said = f"found for the goal {what}" if what else "given as goals"
     return replace(
-        refusal,
-        message=f"all {found.reached} configurations found for the goal pose are invalid, "
-        f"the first: {refusal.message.removeprefix('goal is invalid: ')}",
+        refused[0],
+        report=report,
+        message=f"all {len(found.reached)} configurations {said} are invalid, the first: "
+        f"{notes[0].reason}",
     )
 
 

@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pose goals: configurations that bring a link to a pose, and that a checker accepts."""
+"""Goals that are not a configuration: a pose of a link, a region that it shall reach."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning._protocol import CheckerLike
-from vprism_plan.robots._arrays import KIND_PRISMATIC
-from vprism_plan.robots._frames import frame_poses
+from vprism_plan.planning._inverse_kinematics import Targets, descend, find_tip, tip_poses
 
-_DAMPING = 1e-2
-_LARGEST_STEP = 0.5
+_APART = 0.05  # solutions nearer to each other in every joint are one
 
 
 @dataclass(frozen=True)
 class PoseGoalConfig:
-    """How a pose becomes configurations.
+    """How a pose, or a region, becomes configurations.
 
     Attributes:
         link: the link that is to reach the pose; the end of the robot's longest chain
-            if None.
+            if None. A `ReachRegion` names its own.
         attempts: number of random configurations the solver starts from.
         iterations: steps per attempt.
         position_tolerance: metres between the link and the pose that still count as
@@ -48,190 +47,219 @@ class PoseGoalConfig:
                 raise PlanningError(f"{name} is {getattr(self, name)!r}; it must be more than 0")
 
 
-@dataclass(frozen=True)
-class PoseSolutions:
-    """Configurations found for a pose.
+@dataclass(frozen=True, eq=False)
+class ReachRegion:
+    """A goal: a link's origin somewhere in a box or a ball, its orientation fixed or free.
+
+        plan(checker, q, ReachRegion.box([0.4, -0.1, 0.1], [0.6, 0.1, 0.2], link="panda_hand"))
+
+    Places are drawn from the region, configurations are solved for, and those the checker
+    accepts are the goals. OMPL's own way to sample goals while it plans (`GoalLazySamples`)
+    does not work from Python: its thread never gets the interpreter's lock.
 
     Attributes:
-        valid: accepted by the checker (g, dof), nearest to the reference first.
-        example: one that reaches the pose, accepted or not (dof,); None if none does.
-        reached: how many distinct configurations reach the pose.
+        pose: (4, 4) frame of the region in the world, metres.
+        extent: (3,) half the edges of a box along the axes of `pose`; or (1,) a radius.
+        link: whose origin; the end effector if None.
+        rotation: (3, 3) wanted rotation of the link in the world; None: any.
+        tilt: largest angle between the link's rotation and the wanted one, radians.
+        free_axis: (3,) axis in the link's own frame; turning about it changes nothing (a
+            gripper's approach axis). `tilt` then is the angle between the two axes.
+    """
+
+    pose: np.ndarray
+    extent: np.ndarray
+    link: str | None = None
+    rotation: np.ndarray | None = None
+    tilt: float = 1e-3
+    free_axis: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "pose", np.array(self.pose, dtype=np.float64))
+        require_rigid(self.pose, "pose of a region")
+        extent = np.atleast_1d(np.array(self.extent, dtype=np.float64))
+        if extent.shape not in {(1,), (3,)} or not (np.isfinite(extent) & (extent >= 0.0)).all():
+            raise PlanningError(
+                f"extent is {self.extent!r}; it must be one radius or three half edges, metres, "
+                "finite and not negative"
+            )
+        set_(self, "extent", extent)
+        if self.rotation is not None:
+            whole = np.eye(4)
+            whole[:3, :3] = self.rotation
+            require_rigid(whole, "rotation")
+            set_(self, "rotation", whole[:3, :3])
+        if not (math.isfinite(self.tilt) and 0.0 < self.tilt <= math.pi):
+            raise PlanningError(f"tilt is {self.tilt!r}; it must be more than 0 and at most pi")
+        if self.free_axis is not None:
+            axis = np.array(self.free_axis, dtype=np.float64)
+            length = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
+            if not (math.isfinite(length) and length > 1e-9):
+                raise PlanningError(f"free_axis is {self.free_axis!r}; it must be a direction (3,)")
+            if self.rotation is None:
+                raise PlanningError("free_axis without rotation: every orientation is free already")
+            set_(self, "free_axis", axis / length)
+
+    @classmethod
+    def box(cls, lower: ArrayLike, upper: ArrayLike, **others: Any) -> "ReachRegion":
+        """Return the box between two corners (3,), world, metres; `others` as the attributes."""
+        low, high = np.array(lower, dtype=np.float64), np.array(upper, dtype=np.float64)
+        if low.shape != (3,) or high.shape != (3,) or not (low <= high).all():
+            raise PlanningError(f"box from {lower!r} to {upper!r}; give two corners, lower first")
+        pose = np.eye(4)
+        pose[:3, 3] = 0.5 * (low + high)
+        return cls(pose, 0.5 * (high - low), **others)
+
+    @classmethod
+    def sphere(cls, center: ArrayLike, radius: float, **others: Any) -> "ReachRegion":
+        """Return the ball around a point (3,), world, metres; `others` as the attributes."""
+        pose = np.eye(4)
+        middle = np.array(center, dtype=np.float64)
+        if middle.shape != (3,):
+            raise PlanningError(f"center is {center!r}; it must be a point (3,)")
+        pose[:3, 3] = middle
+        return cls(pose, np.array([radius]), **others)
+
+    def contains(
+        self, rotations: Float[np.ndarray, "n 3 3"], positions: Float[np.ndarray, "n 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Return which poses of the link are in the region, up to rounding (1e-9)."""
+        local = (positions - self.pose[:3, 3]) @ self.pose[:3, :3]
+        if len(self.extent) == 1:
+            inside = np.linalg.norm(local, axis=1) <= self.extent[0] + 1e-9
+        else:
+            inside = (np.abs(local) <= self.extent + 1e-9).all(axis=1)
+        if self.rotation is None:
+            return inside
+        return inside & (self._off(rotations) <= self.tilt + 1e-9)
+
+    def _off(self, rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+        """Angle to the wanted orientation, radians."""
+        assert self.rotation is not None
+        if self.free_axis is None:
+            turns = Rotation.from_matrix(self.rotation @ rotations.transpose(0, 2, 1))
+            return np.asarray(turns.magnitude())
+        now, wanted = rotations @ self.free_axis, self.rotation @ self.free_axis
+        sine = np.linalg.norm(np.cross(now, wanted), axis=1)
+        return np.arctan2(sine, now @ wanted)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Targets:
+        """Draw targets, places uniform in the region, orientations within half the tilt."""
+        if len(self.extent) == 1:
+            local = rng.normal(size=(n, 3))
+            local /= np.linalg.norm(local, axis=1, keepdims=True)
+            local *= self.extent[0] * np.cbrt(rng.uniform(size=(n, 1)))
+        else:
+            local = self.extent * rng.uniform(-1.0, 1.0, (n, 3))
+        # Solutions may miss their target by a little and must still be inside.
+        positions = self.pose[:3, 3] + 0.999 * local @ self.pose[:3, :3].T
+        if self.rotation is None:
+            return Targets(positions)
+        tilt = rng.normal(size=(n, 3))
+        tilt *= 0.5 * self.tilt * rng.uniform(size=(n, 1)) / np.linalg.norm(tilt, axis=1)[:, None]
+        rotations = Rotation.from_rotvec(tilt).as_matrix() @ self.rotation
+        return Targets(positions, rotations, self.free_axis)
+
+
+@dataclass(frozen=True)
+class GoalSolutions:
+    """Configurations found for a pose or a region.
+
+    Attributes:
+        reached: distinct configurations that reach it (n, dof), nearest to the reference
+            first, whether or not a checker accepts them.
         attempts: how many were tried.
     """
 
-    valid: np.ndarray
-    example: np.ndarray | None
-    reached: int
+    reached: np.ndarray
     attempts: int
 
 
-# Names that mean "the point that is to reach a pose", in order of preference.
-_TIP_NAMES = ("tcp", "tool0", "tool", "ee_link", "ee", "tip", "end_effector", "hand")
-
-
-def configurations_at_pose(
-    checker: CheckerLike,
+def solve_pose(
+    robot: Any,
     pose: Float[np.ndarray, "4 4"],
     reference: Float[np.ndarray, " dof"],
     seed: int,
     config: PoseGoalConfig,
-) -> PoseSolutions:
-    """Find configurations that bring a link of the checker's robot to a pose.
+) -> GoalSolutions:
+    """Find configurations that bring a link to a pose.
 
-    Damped least squares on the pose error (Buss 2004, "Introduction to inverse
-    kinematics", section 6), batched over random starts within the joint limits, in
-    float64 on the same arrays as the collision kernels. (The solver of
-    pytorch-kinematics reads its offsets in float32 and leaves mimic joints out.)
+    From random starts within the joint limits, in float64, with mimic and continuous joints.
+    (`benchmarks/inverse_kinematics.py` compares pytorch-kinematics' solver: it reads its
+    offsets in float32 and leaves mimic joints out.)
 
     Args:
-        checker: accepts or refuses configurations; its robot has `arrays`, `link_poses`.
+        robot: with `arrays` and `link_poses`.
         pose: wanted pose of the link in the world, metres.
-        reference: first start of the solver; solutions are sorted by their distance
-            to it.
+        reference: first start of the solver; solutions are sorted by their distance to it.
         seed: of the random starts.
         config: which link, tolerances, number of attempts.
 
     Raises:
         PlanningError: the pose is not a rigid transform, or the link is unknown.
     """
-    _require_rigid(pose)
-    robot = checker.robot
-    if not (hasattr(robot, "arrays") and hasattr(robot, "link_poses")):
-        raise PlanningError(
-            f"a {type(robot).__name__} has no kinematics to solve a pose with; "
-            "give the goal as joint values"
-        )
+    require_rigid(pose, "goal pose")
     rng = np.random.default_rng(seed)
-    low, high = np.asarray(robot.lower), np.asarray(robot.upper)
-    q = rng.uniform(low, high, (config.attempts, robot.dof))
+    tip = find_tip(robot, config.link, np.random.default_rng(seed))
+    n = config.attempts
+    targets = Targets(np.tile(pose[:3, 3], (n, 1)), np.tile(pose[:3, :3], (n, 1, 1)))
+    q, away, turn = descend(
+        robot, tip, targets, _starts(robot, reference, n, rng), config.iterations
+    )
+    good = (away <= config.position_tolerance) & (turn <= config.rotation_tolerance)
+    return GoalSolutions(_distinct(q[good], reference), n)
+
+
+def solve_region(
+    robot: Any,
+    region: ReachRegion,
+    reference: Float[np.ndarray, " dof"],
+    seed: int,
+    config: PoseGoalConfig,
+) -> GoalSolutions:
+    """Find configurations that bring a link into a region; arguments as `solve_pose`."""
+    rng = np.random.default_rng(seed)
+    tip = find_tip(robot, region.link or config.link, np.random.default_rng(seed))
+    starts = _starts(robot, reference, config.attempts, rng)
+    targets = region.draw(config.attempts, rng)
+    q, _, _ = descend(robot, tip, targets, starts, config.iterations)
+    return GoalSolutions(
+        _distinct(q[region.contains(*tip_poses(robot, tip, q))], reference), config.attempts
+    )
+
+
+def _starts(
+    robot: Any, reference: Float[np.ndarray, " dof"], n: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n dof"]:
+    q = rng.uniform(np.asarray(robot.lower), np.asarray(robot.upper), (n, robot.dof))
     q[0] = reference
-    tip = _find_tip(robot, config.link, rng)
-    solved = _solve(robot, tip, pose, q, config)
-    order = np.argsort(np.linalg.norm(solved - reference, axis=1), kind="stable")
-    distinct: list[np.ndarray] = []
-    for candidate in solved[order]:
-        if all(np.max(np.abs(candidate - other)) > 0.05 for other in distinct):
-            distinct.append(candidate)
-    valid = [q for q in distinct if checker.is_valid(q)][: config.max_goals]
-    return PoseSolutions(
-        valid=np.array(valid).reshape(-1, robot.dof),
-        example=distinct[0] if distinct else None,
-        reached=len(distinct),
-        attempts=config.attempts,
-    )
+    return q
 
 
-def _require_rigid(pose: Float[np.ndarray, "4 4"]) -> None:
-    R = pose[:3, :3]
-    rigid = (
-        np.isfinite(pose).all()
-        and np.allclose(R @ R.T, np.eye(3), atol=1e-6)
-        and np.linalg.det(R) > 0.0
-        and np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0])
-    )
+def _distinct(
+    q: Float[np.ndarray, "n dof"], reference: Float[np.ndarray, " dof"]
+) -> Float[np.ndarray, "m dof"]:
+    """Drop near duplicates; nearest to the reference first."""
+    kept: list[np.ndarray] = []
+    for candidate in q[np.argsort(np.linalg.norm(q - reference, axis=1), kind="stable")]:
+        if all(np.max(np.abs(candidate - other)) > _APART for other in kept):
+            kept.append(candidate)
+    return np.array(kept).reshape(-1, q.shape[1])
+
+
+def require_rigid(pose: np.ndarray, what: str) -> None:
+    """Raise PlanningError unless a matrix is a rigid transform (4, 4)."""
+    rigid = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
+    if rigid:
+        R = pose[:3, :3]
+        rigid = (
+            np.allclose(R @ R.T, np.eye(3), atol=1e-6)
+            and float(np.linalg.det(R)) > 0.0
+            and np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0])
+        )
     if not rigid:
         raise PlanningError(
-            f"goal pose {pose.tolist()} is not a rigid transform; it needs an orthonormal rotation "
+            f"{what} {pose.tolist()} is not a rigid transform; it needs an orthonormal rotation "
             "with determinant 1, a translation in metres and the last row 0 0 0 1"
         )
-
-
-@dataclass(frozen=True)
-class _Tip:
-    """A link that follows frame `frame` at the constant pose `offset`."""
-
-    frame: int
-    offset: np.ndarray
-    chain: tuple[int, ...]
-
-
-def _find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> _Tip:
-    """Find the frame a link is attached to: the deepest one it does not move against."""
-    parent = robot.arrays.parent
-    two = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
-    links = [robot.link_poses(q) for q in two]
-    R, t = frame_poses(robot.arrays, two)
-    name = _default_link(tuple(links[0])) if link is None else link
-    if name not in links[0]:
-        raise PlanningError(
-            f"{robot.name} has no link {name!r}; its links are {', '.join(links[0])}"
-        )
-    for frame in reversed(range(len(parent))):
-        offsets = [_rigid_inverse(R[i, frame], t[i, frame]) @ links[i][name] for i in (0, 1)]
-        if np.allclose(offsets[0], offsets[1], atol=1e-9):
-            chain = []
-            walk = frame
-            while walk > 0:
-                chain.append(walk)
-                walk = int(parent[walk])
-            return _Tip(frame, offsets[0], tuple(chain))
-    raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
-
-
-def _default_link(names: tuple[str, ...]) -> str:
-    for ending in _TIP_NAMES:
-        for name in reversed(names):
-            if name == ending or name.endswith("_" + ending):
-                return name
-    raise PlanningError(
-        "no link is recognisable as the end effector; name one in "
-        f"PoseGoalConfig(link=...): {', '.join(names)}"
-    )
-
-
-def _rigid_inverse(
-    R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
-    T = np.eye(4)
-    T[:3, :3] = R.T
-    T[:3, 3] = -R.T @ t
-    return T
-
-
-def _solve(
-    robot: Any,
-    tip: _Tip,
-    pose: Float[np.ndarray, "4 4"],
-    q: Float[np.ndarray, "n dof"],
-    config: PoseGoalConfig,
-) -> Float[np.ndarray, "m dof"]:
-    """Return those of the starts q that reach the pose, moved there."""
-    free = np.asarray(robot.continuous, dtype=bool)
-    for _ in range(config.iterations):
-        error, J = _error_and_jacobian(robot.arrays, tip, pose, q)
-        damped = J @ J.transpose(0, 2, 1) + _DAMPING**2 * np.eye(6)
-        step = np.einsum("nji,nj->ni", J, np.linalg.solve(damped, error[..., None])[..., 0])
-        largest = np.max(np.abs(step), axis=1, keepdims=True)
-        q = q + step * np.minimum(1.0, _LARGEST_STEP / np.maximum(largest, 1e-300))
-        q = np.where(
-            free, np.mod(q + np.pi, 2 * np.pi) - np.pi, np.clip(q, robot.lower, robot.upper)
-        )
-    error, _ = _error_and_jacobian(robot.arrays, tip, pose, q)
-    reached = _reached(error, config)
-    return q[reached]
-
-
-def _reached(error: Float[np.ndarray, "n 6"], config: PoseGoalConfig) -> Bool[np.ndarray, " n"]:
-    near = np.linalg.norm(error[:, :3], axis=1) <= config.position_tolerance
-    return near & (np.linalg.norm(error[:, 3:], axis=1) <= config.rotation_tolerance)
-
-
-def _error_and_jacobian(
-    arrays: Any, tip: _Tip, pose: Float[np.ndarray, "4 4"], q: Float[np.ndarray, "n dof"]
-) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "n 6 dof"]]:
-    """Pose error (metres, rotation vector in the world) and the geometric Jacobian."""
-    R, t = frame_poses(arrays, q)
-    R_tip = R[:, tip.frame] @ tip.offset[:3, :3]
-    t_tip = R[:, tip.frame] @ tip.offset[:3, 3] + t[:, tip.frame]
-    turn = Rotation.from_matrix(pose[:3, :3] @ R_tip.transpose(0, 2, 1)).as_rotvec()
-    error = np.concatenate([pose[:3, 3] - t_tip, turn], axis=1)
-    J = np.zeros((len(q), 6, q.shape[1]))
-    for f in tip.chain:
-        axis = R[:, f] @ arrays.axis[f]
-        column = arrays.q_index[f]
-        if arrays.kind[f] == KIND_PRISMATIC:
-            J[:, :3, column] += arrays.q_mult[f] * axis
-        else:
-            J[:, :3, column] += arrays.q_mult[f] * np.cross(axis, t_tip - t[:, f])
-            J[:, 3:, column] += arrays.q_mult[f] * axis
-    return error, J

@@ -32,7 +32,8 @@ class RiskObjective:
     """Asks `plan` for little risk in place of a short path.
 
     Attributes:
-        kind: "joint", "survival", "occupancy" or "entropy"; see `VPrismRiskObjective`.
+        kind: "joint", "survival", "occupancy", "entropy" or a function; see
+            `VPrismRiskObjective`.
         spacing: metres of sphere motion between samples of a motion.
         length_weight: cost of a unit of path length (the state space's distance, radians
             and metres alike), beside the risk. It also is what informed sampling and
@@ -41,17 +42,23 @@ class RiskObjective:
             (`VPrismMinimaxRiskObjective`); length then does not count.
     """
 
-    kind: str = "joint"
+    kind: str | Rates = "joint"
     spacing: float = 0.02
     length_weight: float = 1e-3
     worst: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
+        if not callable(self.kind) and self.kind not in KINDS:
             raise PlanningError(
-                f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}"
+                f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}, or a function"
             )
         _require_weight(self.length_weight)
+
+    @property
+    def name(self) -> str:
+        """The kind, and whether the worst state counts alone."""
+        kind = self.kind if isinstance(self.kind, str) else "function"
+        return f"worst {kind}" if self.worst else kind
 
     def cost(self, checker: Any) -> "PathCost":
         """Return what paths of a checker's robot cost; draws and bakes worlds if need be."""

@@ -27,7 +27,7 @@ from vprism_plan.planning._search import SearchOutcome, SearchRequest, search
 from vprism_plan.planning._second_opinion import refuse_unfit, reviewed
 from vprism_plan.planning._shortcut import cheapen, shorten
 from vprism_plan.planning._verify import MotionCheck, resample, split_turns, verified
-from vprism_plan.planning.goals import PoseGoalConfig
+from vprism_plan.planning.goals import PoseGoalConfig, ReachRegion
 from vprism_plan.planning.objectives import PathCost, RiskObjective
 from vprism_plan.planning.ompl_adapter import check_straight, shortest_step
 from vprism_plan.planning.result import Improvement, PlanReport, PlanResult
@@ -40,7 +40,7 @@ _SEED_STRIDE = 0x9E3779B1
 def plan(
     checker: CheckerLike,
     start: ArrayLike | Sequence[float],
-    goal: ArrayLike | Sequence[float],
+    goal: ArrayLike | Sequence[float] | ReachRegion,
     planner: str = "RRTConnect",
     time_limit: float | int = 5.0,
     seed: int = 0,
@@ -70,8 +70,10 @@ def plan(
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
         start: start configuration (dof,), radians or metres.
-        goal: goal configuration (dof,), or the pose (4, 4) of the end effector in the
-            world frame (see `pose_goal`).
+        goal: goal configuration (dof,); or several, (g, dof), of which any will do; or the
+            pose (4, 4) of the end effector in the world frame; or a `ReachRegion`. Where
+            some configurations are refused, `report.refused_goals` says why. (A robot of
+            four joints: a (4, 4) array is a pose if its last row is 0 0 0 1.)
         planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
             BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
         time_limit: time for the search in seconds, more than 0; on `clock`.
@@ -91,7 +93,7 @@ def plan(
             joint space; no waypoints are added if None. An edge whose pieces do not all
             pass the check by themselves stays whole.
         clearance_step: distance between the samples of the reported clearance.
-        pose_goal: how a pose is turned into configurations.
+        pose_goal: how a pose, or a region, is turned into configurations.
         second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
             the path is still handed out: the report and the message say so.
         clock: what limits, and all times of the report, are measured by: "wall", or
@@ -127,11 +129,14 @@ def plan(
     refusal = refuse(checker, q_start, "start", report)
     if refusal is not None:
         return refusal
-    goals = valid_goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
-    if isinstance(goals, PlanResult):
-        return goals
+    ends = valid_goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
+    if isinstance(ends, PlanResult):
+        return ends
+    goals, report = ends
     refuse_deadlock(planner, goals)
-    report = replace(report, state_checks=1 + len(goals), motion_checks=len(goals))
+    report = replace(
+        report, state_checks=1 + len(goals) + len(report.refused_goals), motion_checks=len(goals)
+    )
     cost, prepared = _prepared(checker, objective, planner, now)
     report = replace(report, **prepared)
     finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step, now, cost)
@@ -175,8 +180,7 @@ def _prepared(
         )
     began = now()
     cost = objective.cost(checker)
-    name = f"worst {objective.kind}" if objective.worst else objective.kind
-    return cost, {"objective": name, "objective_time": now() - began}
+    return cost, {"objective": objective.name, "objective_time": now() - began}
 
 
 def _riskless(cost: PathCost, path: Float[np.ndarray, "t dof"]) -> bool:

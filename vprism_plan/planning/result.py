@@ -34,6 +34,19 @@ class Improvement:
 
 
 @dataclass(frozen=True)
+class RefusedGoal:
+    """A configuration that reaches the goal but that nobody may be in.
+
+    Attributes:
+        q: (dof,) radians and metres.
+        reason: what the checker says.
+    """
+
+    q: tuple[float, ...]
+    reason: str
+
+
+@dataclass(frozen=True)
 class PlanReport:
     """The numbers behind a `PlanResult`.
 
@@ -56,8 +69,10 @@ class PlanReport:
         searches: how often the planner ran; more than once if a path it accepted failed
             verification, each time with another seed derived from the given one.
         direct: whether the straight motion to the goal was valid, so that no search ran.
-        goal_index: which of several goal configurations (solutions of a pose) was
-            reached, None if none was.
+        goal_index: which of several goal configurations (those given, or the solutions of a
+            pose or a region, without those refused) was reached, None if none was.
+        refused_goals: which of them were refused, and why. Solutions of a pose or a region
+            are tried, nearest to the start first, until there are enough.
         certified: whether every edge was covered by computed clearances, with nothing
             left to sampling.
         tolerance: largest motion, metres, between a point of the path and a
@@ -100,6 +115,7 @@ class PlanReport:
     searches: int = 0
     direct: bool = False
     goal_index: int | None = None
+    refused_goals: tuple[RefusedGoal, ...] = ()
     certified: bool = False
     tolerance: float = float("nan")
     shares: dict[str, float] = field(default_factory=dict)

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Configurations that bring a link to places and orientations: damped least squares, batched."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from vprism_plan.errors import PlanningError
+from vprism_plan.robots._arrays import KIND_PRISMATIC
+from vprism_plan.robots._frames import frame_poses
+
+_DAMPING = 1e-2
+_LARGEST_STEP = 0.5
+# Names that mean "the point that is to reach a pose", in order of preference.
+_TIP_NAMES = ("tcp", "tool0", "tool", "ee_link", "ee", "tip", "end_effector", "hand")
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Where a link shall be, one target per row.
+
+    Attributes:
+        positions: (n, 3) of the link's origin in the world, metres.
+        rotations: (n, 3, 3) of the link in the world; None: any.
+        free_axis: (3,) unit vector in the link about which it may turn freely; None: none.
+    """
+
+    positions: Float[np.ndarray, "n 3"]
+    rotations: Float[np.ndarray, "n 3 3"] | None = None
+    free_axis: Float[np.ndarray, " 3"] | None = None
+
+
+@dataclass(frozen=True)
+class Tip:
+    """A link that follows frame `frame` at the constant pose `offset` (4, 4).
+
+    Attributes:
+        chain: the frames that move it, itself first.
+    """
+
+    frame: int
+    offset: np.ndarray
+    chain: tuple[int, ...]
+
+
+def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
+    """Find the frame a link is attached to: the deepest one it does not move against.
+
+    Raises:
+        PlanningError: the robot has no kinematics or no such link, or None is asked for and
+            no link is recognisable as the end effector.
+    """
+    if not (hasattr(robot, "arrays") and hasattr(robot, "link_poses")):
+        raise PlanningError(
+            f"a {type(robot).__name__} has no kinematics to solve a pose with; "
+            "give the goal as joint values"
+        )
+    parent = robot.arrays.parent
+    two = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+    links = [robot.link_poses(q) for q in two]
+    R, t = frame_poses(robot.arrays, two)
+    name = _default_link(tuple(links[0])) if link is None else link
+    if name not in links[0]:
+        raise PlanningError(
+            f"{robot.name} has no link {name!r}; its links are {', '.join(links[0])}"
+        )
+    for frame in reversed(range(len(parent))):
+        offsets = [_rigid_inverse(R[i, frame], t[i, frame]) @ links[i][name] for i in (0, 1)]
+        if np.allclose(offsets[0], offsets[1], atol=1e-9):
+            chain = []
+            walk = frame
+            while walk > 0:
+                chain.append(walk)
+                walk = int(parent[walk])
+            return Tip(frame, offsets[0], tuple(chain))
+    raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
+
+
+def _default_link(names: tuple[str, ...]) -> str:
+    for ending in _TIP_NAMES:
+        for name in reversed(names):
+            if name == ending or name.endswith("_" + ending):
+                return name
+    raise PlanningError(
+        "no link is recognisable as the end effector; name one (`link`): " + ", ".join(names)
+    )
+
+
+def _rigid_inverse(
+    R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    T = np.eye(4)
+    T[:3, :3] = R.T
+    T[:3, 3] = -R.T @ t
+    return T
+
+
+def tip_poses(
+    robot: Any, tip: Tip, q: Float[np.ndarray, "n dof"]
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
+    """Return rotations and positions (metres) of the link in the world."""
+    R, t = frame_poses(robot.arrays, q)
+    R_tip = R[:, tip.frame] @ tip.offset[:3, :3]
+    return R_tip, R[:, tip.frame] @ tip.offset[:3, 3] + t[:, tip.frame]
+
+
+def descend(
+    robot: Any, tip: Tip, targets: Targets, q: Float[np.ndarray, "n dof"], iterations: int
+) -> tuple[Float[np.ndarray, "n dof"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Move each start q towards its target, within the joint limits.
+
+    Damped least squares on the pose error (Buss 2004, "Introduction to inverse
+    kinematics", section 6), in float64 on the arrays that the collision kernels use.
+
+    Returns:
+        Configurations, and what is left of the error: metres, radians (0 where any
+        orientation will do).
+    """
+    free = np.asarray(robot.continuous, dtype=bool)
+    for _ in range(iterations):
+        error, J = _error_and_jacobian(robot.arrays, tip, targets, q)
+        damped = J @ J.transpose(0, 2, 1) + _DAMPING**2 * np.eye(error.shape[1])
+        step = np.einsum("nji,nj->ni", J, np.linalg.solve(damped, error[..., None])[..., 0])
+        largest = np.max(np.abs(step), axis=1, keepdims=True)
+        q = q + step * np.minimum(1.0, _LARGEST_STEP / np.maximum(largest, 1e-300))
+        q = np.where(
+            free, np.mod(q + np.pi, 2 * np.pi) - np.pi, np.clip(q, robot.lower, robot.upper)
+        )
+    error, _ = _error_and_jacobian(robot.arrays, tip, targets, q)
+    return q, np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
+
+
+def _error_and_jacobian(
+    arrays: Any, tip: Tip, targets: Targets, q: Float[np.ndarray, "n dof"]
+) -> tuple[Float[np.ndarray, "n e"], Float[np.ndarray, "n e dof"]]:
+    """Error (metres, rotation vector in the world) and the geometric Jacobian; three rows each
+    if any orientation will do, six otherwise."""
+    R, t = frame_poses(arrays, q)
+    R_tip = R[:, tip.frame] @ tip.offset[:3, :3]
+    t_tip = R[:, tip.frame] @ tip.offset[:3, 3] + t[:, tip.frame]
+    J = np.zeros((len(q), 6, q.shape[1]))
+    for f in tip.chain:
+        axis = R[:, f] @ arrays.axis[f]
+        column = arrays.q_index[f]
+        if arrays.kind[f] == KIND_PRISMATIC:
+            J[:, :3, column] += arrays.q_mult[f] * axis
+        else:
+            J[:, :3, column] += arrays.q_mult[f] * np.cross(axis, t_tip - t[:, f])
+            J[:, 3:, column] += arrays.q_mult[f] * axis
+    away = targets.positions - t_tip
+    if targets.rotations is None:
+        return away, J[:, :3]
+    if targets.free_axis is None:
+        turn = Rotation.from_matrix(targets.rotations @ R_tip.transpose(0, 2, 1)).as_rotvec()
+        return np.concatenate([away, turn], axis=1), J
+    now, wanted = R_tip @ targets.free_axis, targets.rotations @ targets.free_axis
+    turn = _turn_between(now, wanted)
+    # What turns about the axis itself does not count, in the error or in the Jacobian.
+    J[:, 3:] -= now[:, :, None] * np.einsum("ni,nij->nj", now, J[:, 3:])[:, None]
+    return np.concatenate([away, turn], axis=1), J
+
+
+def _turn_between(
+    a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """The shortest rotation vectors that turn unit vectors a to b."""
+    across = np.cross(a, b)
+    sine = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(sine, np.einsum("ni,ni->n", a, b))
+    # Opposite directions: any perpendicular axis will do.
+    other = np.cross(a, np.eye(3)[np.argmin(np.abs(a), axis=1)])
+    other /= np.linalg.norm(other, axis=1, keepdims=True)
+    axis = np.where(sine[:, None] > 1e-12, across / np.maximum(sine, 1e-300)[:, None], other)
+    return axis * angle[:, None]
