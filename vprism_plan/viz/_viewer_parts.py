@@ -98,8 +98,19 @@ class LinkSolid:
 
 
 def robot_solids(robot: "Robot") -> dict[str, LinkSolid]:
-    """Return the boxes, cylinders and spheres of a robot's collision geometry, by scene path."""
+    """Return the solids and meshes of a robot's collision geometry, by scene path.
+
+    Mesh files that are missing are left out: the robot was given spheres in their place.
+
+    Raises:
+        RobotError: a mesh file cannot be read.
+    """
     solids = {}
+    for link, meshes in robot.meshes.items():
+        for number, file in enumerate(meshes):
+            if file.path is not None:
+                name = f"/robot/solids/{link}/mesh{number}"
+                solids[name] = LinkSolid(link, file.mesh(), np.eye(4))
     for link, shapes in robot.geometry.items():
         for number, shape in enumerate(shapes):
             solids[f"/robot/solids/{link}/{number}"] = LinkSolid(

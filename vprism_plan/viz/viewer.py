@@ -32,7 +32,7 @@ class Viewer:
         server: the `viser.ViserServer`.
         nodes: what is in the scene, by its path in the scene's tree: "/objects/3",
             "/points/3", "/cameras/0", "/entropy/cloud", "/entropy/slice", "/robot/spheres",
-            "/robot/solids/LINK/0", "/robot/path", "/table".
+            "/robot/solids/LINK/0" (or "mesh0"), "/robot/path"; the table is not among them.
         controls: sliders and boxes by name: "level", "entropy", "height", "time" with a
             trajectory, else the names of the joints; and one box for every group of nodes.
     """
