@@ -313,13 +313,17 @@ def _distance(V, rule, origin, h, solid, x, y, z, slope):
         slope[2] -= az / far
         return value - far
     kept = max(value, 0.0)
-    far = math.sqrt(away + kept * kept)
+    part = 0.5 + 0.5 * min(kept / h, 1.0)
+    far = math.sqrt(part * part * away + kept * kept)
     share = 1.0
     if value > 0.0:
         share = value / far
-    slope[0] = share * slope[0] + ax / far
-    slope[1] = share * slope[1] + ay / far
-    slope[2] = share * slope[2] + az / far
+        if value < h:
+            share += 0.5 * part * away / (h * far)
+    outward = part * part / far
+    slope[0] = share * slope[0] + outward * ax
+    slope[1] = share * slope[1] + outward * ay
+    slope[2] = share * slope[2] + outward * az
     return min(value, 0.0) + far
 
 

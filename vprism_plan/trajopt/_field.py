@@ -30,8 +30,10 @@ class SplineField:
     exceeds a distance by at most that (see `grown`). There is no flat cell on the ridge
     between two equal nodes, as linear interpolation has.
 
-    Outside the grid, a metres from its nearest point c: min(D(c), 0) + hypot(a, max(D(c), 0)),
-    which continues distances outwards; or D(c) - a, if everything outside is an obstacle.
+    Outside the grid, a metres from its nearest point c: min(D(c), 0) + hypot(s a, max(D(c), 0)),
+    which continues distances outwards, with s = 1 where D(c) >= h, falling to 1/2 at 0: where a
+    half-space leaves the grid, the way down must not seem to lead out of it as fast as the
+    half-space's own distance grows. Or D(c) - a, if everything outside is an obstacle.
 
     Args:
         values: (rules, nx, ny, nz) one set of node values per contact rule.
@@ -78,7 +80,9 @@ class SplineField:
         way = torch.where(outside, away, 1.0)
         if self.solid_outside:
             return torch.where(outside, total - way.sqrt(), total)
-        beyond = total.clamp(max=0.0) + (way + total.clamp(min=0.0).square()).sqrt()
+        share = 0.5 + 0.5 * (total / self.spacing).clamp(0.0, 1.0)
+        far = (share.square() * way + total.clamp(min=0.0).square()).sqrt()
+        beyond = total.clamp(max=0.0) + far
         return torch.where(outside, beyond, total)
 
     @cached_property
@@ -155,17 +159,25 @@ def union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spli
 def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> SplineField:
     field = fields[0]
     spacing = float(field.spacing)
-    shape = field.distance.shape
-    first = np.rint(np.asarray(field.origin) / spacing).astype(np.int64)
-    grid = Grid(spacing, first, (shape[0], shape[1], shape[2]))
+    first = np.rint(np.asarray(field.origin) / spacing).astype(np.int64) - 1
+    x, y, z = (n + 2 for n in field.distance.shape)
+    # One more node all around: space outside the grid is a way out of what touches its faces.
+    grid = Grid(spacing, first, (x, y, z))
+    rim = np.zeros(grid.shape, dtype=np.float32)
+    for axis, n in enumerate(grid.shape):
+        ends = np.zeros(n, dtype=np.float32)
+        ends[[0, -1]] = spacing**2
+        rim += ends.reshape([-1 if a == axis else 1 for a in range(3)])
     floor = _plane_distances(grid, planes)
     solid = bool(getattr(field, "solid_outside", False))
     merged = []
     for own in fields:
-        nodes = np.maximum(np.minimum(own.distance, floor), 0.0).astype(np.float32)
-        source = np.zeros(shape, dtype=np.int16)
+        nodes = np.maximum(np.pad(own.distance, 1, mode="edge"), 0.0)
+        nodes = np.where(rim > 0.0, 0.0 if solid else np.sqrt(nodes**2 + rim), nodes)
+        nodes = np.maximum(np.minimum(nodes, floor), 0.0).astype(np.float32)
+        source = np.zeros(grid.shape, dtype=np.int16)
         merged.append(finish(NodeDistances(nodes, source), grid, (), solid).distance)
-    return SplineField(np.stack(merged), np.asarray(field.origin), spacing, solid)
+    return SplineField(np.stack(merged), grid.origin, spacing, solid)
 
 
 def _plane_distances(

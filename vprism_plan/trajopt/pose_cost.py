@@ -77,6 +77,8 @@ class PoseCost(TrajectoryCost):
                 robot.arrays,
                 sphere_center=np.ascontiguousarray(ends),
                 sphere_frame=np.full(4, sits.frame, dtype=np.int64),
+                sphere_radius=np.zeros(4),
+                sphere_link=np.zeros(4, dtype=np.int64),
             )
         )
 
