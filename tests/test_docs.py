@@ -82,6 +82,11 @@ def test_every_example_is_numbered_explained_and_mentioned_in_the_pages(reposito
         assert script.stem in told, f"no page links to {script.name}"
 
 
+def test_examples_are_numbered_without_gaps(repository):
+    numbers = sorted({int(script.name[:2]) for script in examples(repository)})
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
 def test_every_package_has_a_reference_page_and_every_command_its_help(docs, site_code, repository):
     api_pages = pytest.importorskip("api_pages", reason="sphinx is not installed (extra `docs`)")
     packages = {p.parent.name for p in (repository / "vprism_plan").glob("*/__init__.py")}

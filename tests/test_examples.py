@@ -62,6 +62,17 @@ def test_margins_name_the_nearest_pair_and_keep_what_the_checker_keeps(said_by):
 
 
 @pytest.mark.slow
+def test_a_robot_without_spheres_gets_some_that_hold_it_and_a_path(said_by):
+    pytest.importorskip("pybullet_data", reason="pybullet is not installed (extra `evaluation`)")
+    said = said_by("07")
+    links = re.findall(r"lbr_iiwa_link_\d .*", said)
+    assert len(links) == 8
+    assert all("proved" in link and "100.0 %" in link for link in links)
+    assert "the same spheres when read: True" in said
+    assert re.search(r"^exact path", said, flags=re.M)
+
+
+@pytest.mark.slow
 def test_your_own_ompl_program_leaves_without_binding_noise(repository, saved_demo_map, tmp_path):
     script = repository / "examples" / "02_your_own_ompl_program.py"
     picture = tmp_path / "02.png"

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How the gallery runs the examples: each writes its picture where it is told to."""
+"""How the gallery runs the examples: each writes its picture where it is told to.
 
+Examples that take a map are given one, so that the scene is fitted once: the first example
+shows that, and the code that would fit it is the same line in all of them.
+"""
+
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
 
+from demo_map import saved
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx_gallery.scrapers import figure_rst
@@ -12,17 +18,20 @@ from sphinx_gallery.scrapers import figure_rst
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Check at the end that every example was run and drew something."""
+    logging.getLogger("vprism_plan").setLevel(logging.WARNING)  # else it fills the pages
     app.connect("build-finished", _require_pictures)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
 def arguments(gallery_conf: dict[str, Any], script_vars: dict[str, Any]) -> list[str]:
-    """Return the command line of an example; programs may also ask for their own place."""
+    """Return the command line of an example."""
     picture = _picture(gallery_conf, script_vars["src_file"])
     picture.parent.mkdir(parents=True, exist_ok=True)
     picture.unlink(missing_ok=True)
     script_vars["example_globals"]["__file__"] = script_vars["src_file"]
-    return ["--picture", str(picture)]
+    if '"--map"' not in Path(script_vars["src_file"]).read_text(encoding="utf-8"):
+        return ["--picture", str(picture)]
+    return ["--picture", str(picture), "--map", str(saved(picture.parent))]
 
 
 def scrape(block: Any, block_vars: dict[str, Any], gallery_conf: dict[str, Any]) -> str:

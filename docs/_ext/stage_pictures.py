@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from demo_map import fitted
 from sphinx.application import Sphinx
 
 _STEP = 0.004  # metres per pixel
@@ -25,9 +26,8 @@ def _draw(app: Sphinx) -> None:
     from vprism_plan.viz import save_figure, scene_figure
 
     folder.mkdir(parents=True, exist_ok=True)
-    view = vp.load_observation(Path(vp.__file__).parent / "data" / "demo_scene")
-    save_figure(scene_figure(view), folder / "view.png")
-    world = vp.World(vp.fit_map(view))
+    world = vp.World(fitted())
+    save_figure(scene_figure(world.map.views[0]), folder / "view.png")
     save_figure(_world_figure(world), folder / "world.png")
     save_figure(_distance_figure(world), folder / "distance.png")
 
