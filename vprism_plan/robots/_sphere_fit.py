@@ -27,10 +27,11 @@ from jaxtyping import Bool, Float, Int
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._mesh_spheres import candidate_cells, greedy_cover
 
-# Lattice cells along the longest edge of a link's box.
-_CELLS = 18
-# Longest edge of the triangles that spheres hold, in cells.
-_EDGE = 1.5
+# Cells along the edge of a cube as large as a link's box, and along its longest edge.
+_CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
+# Longest edge of the triangles that spheres hold, in cells, and in tolerances if these are
+# smaller: a sphere cannot be finer than what it must hold.
+_EDGE, _FINE, _FINEST = 1.5, 2.0, 0.5
 _MOST, _ARM_SIZED = 12, 0.35
 _CENTRES = 400
 _ROUNDS = 30
@@ -97,7 +98,7 @@ def fit_spheres(
 ) -> Float[np.ndarray, "n 4"]:
     """Spheres whose union holds a surface, and what it encloses.
 
-    Of the inside, the cells of a lattice (an 18th of the longest edge) are held that the
+    Of the inside, the cells of a lattice (18 to 40 along the longest edge) are held that the
     surface does not reach; what is left lies within two cells of the surface.
 
     Args:
@@ -116,7 +117,7 @@ def fit_spheres(
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
 def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
-    surface = _Surface.of(np.frombuffer(corners).reshape(-1, 3, 3))
+    surface = _Surface.of(np.frombuffer(corners).reshape(-1, 3, 3), tolerance)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
     depth = -surface.lattice[tuple(index.T)]
@@ -160,13 +161,16 @@ class _Surface:
     lattice: Float[np.ndarray, "x y z"] = field(repr=False)
 
     @classmethod
-    def of(cls, triangles: Float[np.ndarray, "f 3 3"]) -> _Surface:
+    def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> _Surface:
         from scipy import ndimage
         from scipy.spatial import cKDTree
 
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-        cell = float((high - low).max()) / _CELLS
-        points, faces = _merged(split_triangles(triangles, _EDGE * cell))
+        longest = float((high - low).max())
+        cell = float(np.cbrt((high - low).prod())) / _CELLS
+        cell = min(max(cell, longest / _MOST_CELLS), longest / _FEWEST)
+        edge = min(_EDGE * cell, max(_FINE * tolerance, _FINEST * cell))
+        points, faces = _merged(split_triangles(triangles, edge))
         # No path from cell to cell passes between corners so near to each other.
         small = split_triangles(points[faces], 0.8 * cell)
         dense, _ = _merged(small)
@@ -255,7 +259,7 @@ def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> l
 
 def _settled(
     surface: _Surface, centres: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 4"], float]:
+) -> tuple[Float[np.ndarray, "m 4"], float]:
     """Move spheres until their largest protrusion stands still; return it, too."""
     centres = centres.copy()
     reach = surface.reach(centres)
@@ -306,7 +310,7 @@ def _tightened(
     centres: Float[np.ndarray, "n 3"],
     reach: Float[np.ndarray, "n t"],
     radius: Float[np.ndarray, "n"],
-) -> tuple[Float[np.ndarray, "n 4"], float]:
+) -> tuple[Float[np.ndarray, "m 4"], float]:
     """Cut every radius to what no other sphere holds, worst first."""
     centres, reach, radius = centres.copy(), reach.copy(), radius.copy()
     kept = np.ones(len(centres), dtype=bool)
