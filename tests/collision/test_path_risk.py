@@ -604,7 +604,17 @@ def bounded(strict_world, ball_robot):
     }
 
 
-def test_validity_is_few_enough_worlds_and_nothing_certain(bounded, small, doubtful):
+def on_level_set(checker, places, room=0.0):
+    """Where a ball touches what verdicts go by if the bound is below the level."""
+    if checker.config.max_risk >= checker.world.config.level:
+        return np.zeros(len(places), bool)
+    field = checker.world.certain_field(level_set=True)
+    return field.lower_bound(np.ascontiguousarray(places)) <= RADIUS + room
+
+
+def test_validity_is_few_enough_worlds_nothing_certain_and_off_the_level_set(
+    bounded, small, doubtful
+):
     drawn = DrawnVoxels(small, 128, 7, H)
     Q = np.random.default_rng(6).choice(doubtful, 100)
     valid = {}
@@ -616,9 +626,10 @@ def test_validity_is_few_enough_worlds_and_nothing_certain(bounded, small, doubt
         hits = np.array([ball_touches(drawn, q, RADIUS, H).sum() for q in Q])
         estimates = [checker.collision_probability(q) for q in Q]
         certain = np.array([e.certain for e in estimates])
-        expected = ~certain & (hits <= checker._risk().allowed)
+        off = ~on_level_set(checker, Q)
+        expected = ~certain & (hits <= checker._risk().allowed) & off
         np.testing.assert_array_equal(singles, expected)
-        np.testing.assert_array_equal(singles, [e.upper <= bound for e in estimates])
+        np.testing.assert_array_equal(singles, off & [e.upper <= bound for e in estimates])
         valid[bound] = singles
     assert not (valid[0.05] & ~valid[0.2]).any()
     assert not (valid[0.2] & ~valid[0.6]).any()
@@ -633,7 +644,10 @@ def test_edges_are_free_if_their_joint_risk_is_within_the_bound(bounded, doubtfu
         for bound, checker in bounded.items():
             estimate = checker.collision_probability([qa, qb])
             free = checker.check_motion(qa, qb)
-            assert free == (estimate.upper <= bound)
+            if free != (estimate.upper <= bound):
+                between = qa + np.linspace(0.0, 1.0, 200)[:, None] * (qb - qa)
+                assert not free
+                assert on_level_set(checker, between, room=0.002).any()
             if free:
                 assert checker.is_valid(qa)
                 assert checker.is_valid(qb)
@@ -738,3 +752,24 @@ def test_worlds_without_a_posterior_are_refused():
         checker.collision_probability(np.zeros(2))
     with pytest.raises(ConfigError, match="posterior"):
         CollisionChecker(world, as_robot(arrays), CheckerConfig(max_risk=0.1))
+
+
+def test_a_bound_on_risk_does_not_let_a_ball_shave_the_level_set(free_world, ball_robot, doubtful):
+    """Voxels count as inscribed balls: the draws alone passed paths 2 mm inside seen surfaces."""
+    robot = ball_robot(RADIUS)
+    plain = CollisionChecker(free_world, robot, config())
+    bounded = CollisionChecker(free_world, robot, config(max_risk=0.3))
+    loose = CollisionChecker(free_world, robot, config(max_risk=0.6))
+    rng = np.random.default_rng(5)
+    low, high = doubtful.min(axis=0) - 0.03, doubtful.max(axis=0) + 0.03
+    places = rng.uniform(low, high, (4000, 3))
+    refused = ~plain.is_valid_batch(places)
+    assert refused.sum() > 100
+    assert not bounded.is_valid_batch(places[refused]).any()
+    # Above the level the draws decide alone: half of them may object.
+    assert loose.is_valid_batch(places[refused]).any()
+    for q in places[refused][:20]:
+        assert not bounded.explain(q).valid
+    for a, b in places[:300].reshape(-1, 2, 3):
+        if bounded.check_motion(a, b):
+            assert plain.check_motion(a, b)

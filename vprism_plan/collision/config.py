@@ -27,7 +27,9 @@ class CheckerConfig:
             from its posterior instead of by the level set, at P(occupied) = 1/2 of each
             draw whatever `WorldConfig.level` is: a configuration or an edge is
             free if the upper confidence bound of its probability of coming within `margin`
-            is at most `max_risk`. Everything else is refused as without a bound. None: level set.
+            is at most `max_risk`. Everything else is refused as without a bound, and so is
+            the level set if `max_risk` is below its level: draws are counted by voxels, and
+            alone would let a path shave a surface that was seen. None: level set.
         allowed_contacts: Link or SRDF group -> ids of the objects it may touch; for
             example {"hand": {3}}. What a link may touch, it may also pass through.
         n_worlds: Worlds drawn for probabilities, a multiple of 64.

@@ -91,8 +91,8 @@ class RuledWorld(BakedWorld, Protocol):
         """Distance to one object alone."""
         ...
 
-    def certain_field(self, without: Collection[int] = ()) -> NodeField:
-        """Distance to what is an obstacle whatever the posterior says."""
+    def certain_field(self, without: Collection[int] = (), level_set: bool = False) -> NodeField:
+        """Distance to what is an obstacle whatever the posterior says, and to the level set."""
         ...
 
     def posterior_worlds(self, n_worlds: int, seed: int, reach: float) -> Any:

@@ -224,25 +224,32 @@ class World:
             self._cache[key] = self._field([kept, unseen, self._known])
         return self._cache[key]
 
-    def certain_field(self, without: Collection[int] = ()) -> DistanceField:
+    def certain_field(
+        self, without: Collection[int] = (), level_set: bool = False
+    ) -> DistanceField:
         """Distance to what is an obstacle whatever the posterior says.
 
         Background, seen parts that the level set misses, known geometry, unobserved space
         by its policy, and occluded space where the map has too little support to judge
-        (unless the policy is "free"). The rest is for `posterior_worlds` to say. The seen
-        parts of the objects `without` are left out.
+        (unless the policy is "free"). The rest is for `posterior_worlds` to say; with
+        `level_set`, the objects where P(occupied) >= level belong to it as well. The
+        objects `without`, and their seen parts, are left out.
 
         Raises:
             WorldError: the map has no such object.
         """
         gone = frozenset(self._classes(without))
-        key = ("certain", gone)
+        key = ("certain and level set" if level_set else "certain", gone)
         if key not in self._cache:
             if self._beyond_support is None:
                 free = self.config.occluded == "free"
                 self._beyond_support = self._mark_unseen("free" if free else "posterior")
             marks = self._without(self._beyond_support, gone) if gone else self._beyond_support
-            self._cache[key] = self._field([self._unseen_distances(marks), self._known])
+            parts = [self._unseen_distances(marks), self._known]
+            if level_set:
+                rest = set(range(1, len(self.map.object_ids) + 1)) - gone
+                parts.append(self._object_distances(rest))
+            self._cache[key] = self._field(parts)
         return self._cache[key]
 
     def posterior_worlds(
