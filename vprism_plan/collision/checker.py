@@ -93,7 +93,9 @@ class CollisionChecker(Queries):
                 self._fields, self._world = self._within_level_set()
         self._warm_up()
 
-    def _within_level_set(self) -> tuple[list[NodeField], tuple[np.ndarray, ...]]:
+    def _within_level_set(
+        self,
+    ) -> tuple[list[NodeField], tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Return what verdicts go by where the bound on risk lies below the level.
 
         Touching a point that is occupied with at least the probability `level` breaks such a
