@@ -57,7 +57,6 @@ print(f"planned, no bound: {plain.collision_probability(shortest.path).text()}")
 bounded = vp.CollisionChecker(world, robot, vp.CheckerConfig(max_risk=0.05))
 result = vp.plan(bounded, START, GOAL)
 print(f"planned, max_risk 0.05: {result.status}, {result.report.risk.text()}")
-print(bounded.safety_margin(result.path).text(5))
 
 # %%
 # Where the path sweeps through the map and what the map knows there; below, entropy and
