@@ -15,6 +15,7 @@ from vprism_plan.world.grid import Grid
 
 _STEPS = 512.0  # stored per voxel: 64 voxels either way fit 16 bits
 _MOST = 2 << 30  # bytes
+_AROUND = 2.6  # steps from a point to the farthest node that its spline reads
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,8 +23,8 @@ class DrawField:
     """Signed distance to the union of a draw's voxels and what is certain, for every draw.
 
     A voxel that a draw occupies counts as the ball inscribed in it, as in `PosteriorWorlds`.
-    Distances are cut off at `reach`; the nodes cover all that is nearer to any voxel that any
-    draw may occupy.
+    The nodes cover all that is nearer than `reach` to any voxel that any draw may occupy.
+    Distances are cut off so far beyond it that the spline is itself up to there.
 
     Attributes:
         steps: (rules, nx, ny, nz, S) int16: distance in multiples of `unit`, one table per
@@ -58,7 +59,7 @@ def draw_field(
         reach: distances up to this are told apart, metres.
 
     Raises:
-        ConfigError: that would take more than 2 GB.
+        ConfigError: that would take more than 2 GB, or `reach` is more than 57 voxels.
     """
     h = worlds.resolution
     unit = h / _STEPS
@@ -69,6 +70,11 @@ def draw_field(
     whole = int(np.ceil(reach / h)) + 2
     low = possible.min(axis=0) + first - whole
     shape = tuple(int(n) for n in possible.max(axis=0) + first + whole + 1 - low)
+    if reach + _AROUND * h > 60.0 * h:
+        raise ConfigError(
+            f"contacts up to {reach:.3f} m matter, but {60.0 * h:.3f} m is as far as voxels of "
+            f"{h} m tell; lower the temperature, or use a coarser resolution"
+        )
     size = 2 * len(rules) * int(np.prod(shape)) * worlds.n_worlds
     if size > _MOST:
         raise ConfigError(
@@ -98,7 +104,7 @@ def draw_field(
             away = np.minimum(np.maximum(away - np.float32(0.5 * h), 0.0), fixed)
             none = np.zeros(shape, dtype=np.int16)
             signed = finish(NodeDistances(away, none), grid, (), solid_outside=False).distance
-            steps[g, ..., s] = np.floor(np.clip(signed, -60.0 * h, reach) / unit)
+            steps[g, ..., s] = np.floor(np.clip(signed, -60.0 * h, reach + _AROUND * h) / unit)
     lowest = steps.min(axis=4) * np.float32(unit)
     return DrawField(steps, _block_least(lowest), np.array([*grid.origin, h]), unit, reach)
 

@@ -104,7 +104,7 @@ class MapField:
         radii: Float[np.ndarray, " s"],
         rules: Int[np.ndarray, " s"],
     ) -> Float[Tensor, "m s"]:
-        total = torch.zeros_like(centers[..., 0])
+        total = 0.0 * centers[..., 0]  # also far away a number with a gradient, which is 0
         if not np.isfinite(self._lower).all():
             return total
         reach = torch.as_tensor(radii).to(centers)[None, :, None]

@@ -63,6 +63,8 @@ class Samples:
 
     def ways(self, centers: Float[Tensor, "m s 3"]) -> Float[Tensor, "m s"]:
         """Return half the way from the sample before plus half the way to the next, metres."""
+        if len(centers) == 0:
+            return torch.zeros_like(centers[..., 0])
         steps = centers[1:] - centers[:-1]
         squares = steps.square().sum(dim=-1) + SHORT**2
         way = 0.5 * (squares.sqrt() - SHORT)

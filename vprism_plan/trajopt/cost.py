@@ -35,8 +35,8 @@ class TrajectoryCost(torch.nn.Module):
         """Return the cost without its weight."""
         raise NotImplementedError(f"{type(self).__name__} has no evaluate(q)")
 
-    def forward(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
-        """Return the weighted cost of each trajectory.
+    def forward(self, q: Tensor) -> Tensor:
+        """Return the weighted cost of each trajectory: (..., T, dof) to (...).
 
         Args:
             q: waypoints, radians or metres, any floating dtype and device.

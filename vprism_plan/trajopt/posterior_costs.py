@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Costs of what a map's posterior says of the space that a robot passes through."""
 
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from vprism_plan.trajopt._scene import map_and_scene
 from vprism_plan.trajopt._spheres import SphereCost
 from vprism_plan.trajopt.cost import at_least
 
-Measure = Literal["hazard", "probability"]
+MEASURES = ("hazard", "probability")
 
 _MIN_SUPPORT = 0.5  # kernel mass, where no world says
 _CUT = 8.0  # softnesses of gap from which certain obstacles do not count
@@ -107,7 +107,7 @@ class OccupancyCost(_PosteriorCost):
         robot: Any = None,
         *,
         exact: bool = True,
-        measure: Measure = "hazard",
+        measure: str = "hazard",
         arc_length: bool = False,
         spacing: float = 0.05,
         subsamples: int | None = None,
@@ -116,8 +116,8 @@ class OccupancyCost(_PosteriorCost):
         weight: float = 1.0,
         name: str = "occupancy",
     ) -> None:
-        if measure not in get_args(Measure):
-            raise ConfigError(f"measure is {measure!r}; it must be one of {get_args(Measure)}")
+        if measure not in MEASURES:
+            raise ConfigError(f"measure is {measure!r}; it must be one of {MEASURES}")
         super().__init__(
             world, robot, _hazard if measure == "hazard" else _occupancy, exact=exact,
             resolution=resolution, arc_length=arc_length, spacing=spacing,
