@@ -67,12 +67,12 @@ class ReachRegion:
             gripper's approach axis). `tilt` then is the angle between the two axes.
     """
 
-    pose: np.ndarray
-    extent: np.ndarray
+    pose: Any
+    extent: Any
     link: str | None = None
-    rotation: np.ndarray | None = None
+    rotation: Any = None
     tilt: float = 1e-3
-    free_axis: np.ndarray | None = None
+    free_axis: Any = None
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
