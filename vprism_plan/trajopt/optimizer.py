@@ -58,8 +58,9 @@ def optimize(
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
         start: start configuration (dof,), radians or metres.
         goal: goal configuration (dof,).
-        cost: what to minimise, a module (..., T, dof) -> (...), differentiable, float64.
-            None: `default_cost(checker)`; the checker must then have a `World`.
+        cost: what to minimise, a module (..., T, dof) -> (...), differentiable; it is given
+            float64 on the CPU. None: `default_cost(checker)`, which needs a
+            `CollisionChecker`.
         seeds: how many trajectories. The initial paths come first, then the straight line,
             then detours through random free configurations and smooth noise, in turns.
         waypoints: of each, start and goal included, at least 4.
@@ -75,8 +76,9 @@ def optimize(
             still verified. None: no limit. Building the default cost counts (seconds, if
             risk is bounded): build it once and pass it as `cost` where queries follow.
         guard: cost of being where the checker refuses, which repairs add. None: the
-            default cost's own terms with a margin that grows; without a `World` nothing is
-            repaired.
+            default cost's own terms with a margin that grows; nothing is repaired without a
+            `CollisionChecker`. Repairs go on from where the trajectories are and start anew
+            from the seeds in turns.
         repairs: rounds after the first, at most.
         keep_clearance: True: the path's clearance, edges included, must not be below that
             of the initial path (the largest of several); a number: not below so many

@@ -55,8 +55,8 @@ class SeedReport:
         iterations: steps of the optimiser, over all rounds.
         stopped: why its last round ended: "converged", "iterations", "stalled" (no step
             along any direction lowers the cost at this precision) or "time".
-        refused: why it was not returned: what the verification said; empty if it was the
-            winner or was never asked about.
+        refused: what the verification said when it was last asked about this trajectory;
+            empty if it is the one returned, or if it never was: a cheaper one passed.
     """
 
     name: str
