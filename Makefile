@@ -15,7 +15,7 @@ demo: $(STAMP)
 	$(BIN)/vprism-plan demo --output out/demo
 
 test: $(STAMP)
-	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered -n 2
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --durations=40 -n 2
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

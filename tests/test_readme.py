@@ -27,14 +27,15 @@ def test_the_python_example_runs_and_plans(repository):
 def test_what_the_readme_shows_of_risk_contacts_and_margins_runs_after_the_first_example(
     repository,
 ):
-    first, second = blocks((repository / "README.md").read_text(), "python")[:2]
+    first, second, _, fourth = blocks((repository / "README.md").read_text(), "python")
     done = subprocess.run(
-        [sys.executable, "-c", first + second],
+        [sys.executable, "-c", first + second + fourth],
         cwd=repository, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("P(collision)") >= 2
     assert "ends touching, as allowed: panda_hand on object:1" in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("path of")
 
 
 def test_the_ompl_lines_are_those_of_the_example(repository):
