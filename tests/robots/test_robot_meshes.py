@@ -242,3 +242,18 @@ def test_pair_gaps_agree_with_a_plain_count(robots):
         assert (gaps[~near, k] <= exact[~near] + 1e-12).all()
         small = pair_gaps(_of_links(robot.arrays, pairs[k]), q, np.array([[0, 1]]))[:, 0]
         np.testing.assert_allclose(small, gaps[:, k], atol=1e-12)
+
+
+def test_the_second_opinion_takes_the_meshes_themselves(tmp_path):
+    from vprism_plan.collision._solids import robot_solids
+
+    wedge().export(tmp_path / "w.stl")
+    robot = Robot.from_urdf(urdf(tmp_path, "w.stl"), fit=QUICK)
+    (solid,) = robot_solids(robot, "geometry", None)
+    assert solid.shape.kind == "mesh"
+    assert solid.mesh is not None  # closed: its inside counts
+    np.testing.assert_allclose(
+        np.ptp(solid.vertices, axis=0), np.ptp(in_link(wedge().vertices), axis=0), atol=1e-6
+    )
+    padded = robot_solids(robot.with_padding(0.01), "geometry", None)
+    assert {solid.shape.kind for solid in padded} == {"sphere"}

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._sphere_fit import halved_triangles, split_triangles
+from vprism_plan.robots._sphere_fit import Surface, halved_triangles, split_triangles, with_hull
 
 # Where a triangle's edges are shorter than this and it still is in no single sphere, the
 # surface counts as bare, metres.
@@ -81,8 +81,9 @@ def protrusion(
     """How far the union of spheres stands out of a link.
 
     Measured at 200 points of each sphere that lie in no other: their distance to the link, 0
-    inside it. To a mesh the distance is taken to points of it so dense that it is too large
-    by half a millimetre at most where it is two centimetres or more.
+    inside it (an open shell is solid up to its convex hull). To a mesh the distance is taken
+    to points of it so dense that it is too large by half a millimetre at most where it is two
+    centimetres or more.
 
     Args:
         primitives: Solids of the link.
@@ -120,31 +121,23 @@ def _mesh_distance(
     """Distance to a surface, 0 where the surface encloses the point."""
     from scipy.spatial import cKDTree
 
+    triangles = with_hull(triangles)
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     edge = max(0.003, float((high - low).max()) / 60.0)
     dense = split_triangles(triangles, edge)
     samples = np.concatenate([dense.reshape(-1, 3), dense.mean(axis=1)])
     away = np.asarray(cKDTree(samples).query(points)[0])
-    away[_enclosed_by(samples, edge, points)] = 0.0
+    away[_enclosed_by(triangles, points)] = 0.0
     return away
 
 
 def _enclosed_by(
-    samples: Float[np.ndarray, "s 3"],
-    edge: float,
-    points: Float[np.ndarray, "n 3"],
+    triangles: Float[np.ndarray, "f 3 3"], points: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "n"]:
-    """Points in cells that only a way through the samples' cells leads to."""
-    from scipy import ndimage
-
-    low, high, cell = samples.min(axis=0), samples.max(axis=0), 3.0 * edge
-    lower = low - 1.5 * cell
-    counts = np.ceil((high - low) / cell + 3.0).astype(np.int64)
-    touched = np.zeros(tuple(counts), dtype=bool)
-    touched[tuple(np.floor((samples - lower) / cell).astype(np.int64).T)] = True
-    inner = np.asarray(ndimage.binary_fill_holes(touched)) & ~touched
-    at = np.floor((points - lower) / cell).astype(np.int64)
-    there = ((at >= 0) & (at < counts)).all(axis=1)
+    """Points in cells that the surface encloses, as the fit sees it."""
+    surface = Surface.of(triangles, math.inf)
+    at = np.floor((points - surface.lower) / surface.cell).astype(np.int64)
+    there = ((at >= 0) & (at < surface.inner.shape)).all(axis=1)
     result = np.zeros(len(points), dtype=bool)
-    result[there] = inner[tuple(at[there].T)]
+    result[there] = surface.inner[tuple(at[there].T)]
     return result

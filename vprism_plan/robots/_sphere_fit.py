@@ -33,6 +33,7 @@ _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
 # smaller: a sphere cannot be finer than what it must hold.
 _EDGE, _FINE, _FINEST = 1.5, 2.0, 0.5
 _MOST, _ARM_SIZED = 12, 0.35
+_NEXT_TO_NONE = 0.15
 _CENTRES = 400
 _ROUNDS = 30
 # Relative and absolute (metres): what rounding may take away from a radius.
@@ -117,7 +118,7 @@ def fit_spheres(
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
 def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
-    surface = _Surface.of(np.frombuffer(corners).reshape(-1, 3, 3), tolerance)
+    surface = Surface.of(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
     depth = -surface.lattice[tuple(index.T)]
@@ -137,7 +138,7 @@ def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
+class Surface:
     """Small triangles, and a lattice of signed distances to them.
 
     Attributes:
@@ -161,7 +162,7 @@ class _Surface:
     lattice: Float[np.ndarray, "x y z"] = field(repr=False)
 
     @classmethod
-    def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> _Surface:
+    def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> Surface:
         from scipy import ndimage
         from scipy.spatial import cKDTree
 
@@ -207,6 +208,29 @@ class _Surface:
 
         at = (x - self.lower) / self.cell - 0.5
         return np.asarray(map_coordinates(self.lattice, at.T, order=1, mode="nearest"))
+
+
+def with_hull(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "t 3 3"]:
+    """A surface, and its convex hull if it is a shell whose openings a fill runs out of.
+
+    Published meshes are often shells with holes, their faces turned either way: nothing says
+    what is inside. Where next to none of what the hull holds is enclosed, the link counts as
+    solid up to its hull: all of that is held, and none of it counts as standing out.
+    """
+    import trimesh
+    from scipy.spatial import ConvexHull, QhullError
+
+    if trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=True).is_watertight:
+        return triangles
+    points = triangles.reshape(-1, 3)
+    try:
+        hull = ConvexHull(points)
+    except QhullError:  # flat: nothing is inside
+        return triangles
+    surface = Surface.of(triangles, math.inf)
+    if surface.inner.sum() * surface.cell**3 > _NEXT_TO_NONE * hull.volume:
+        return triangles
+    return np.concatenate([triangles, points[hull.simplices]])
 
 
 def _merged(
@@ -258,7 +282,7 @@ def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> l
 
 
 def _settled(
-    surface: _Surface, centres: Float[np.ndarray, "n 3"]
+    surface: Surface, centres: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "m 4"], float]:
     """Move spheres until their largest protrusion stands still; return it, too."""
     centres = centres.copy()
@@ -282,7 +306,7 @@ def _settled(
 
 
 def _moved(
-    surface: _Surface, centre: Float[np.ndarray, "3"], own: Int[np.ndarray, "k"]
+    surface: Surface, centre: Float[np.ndarray, "3"], own: Int[np.ndarray, "k"]
 ) -> Float[np.ndarray, "3"]:
     """Where a sphere that holds these triangles stands out least, by a pattern search."""
     from scipy.spatial.distance import cdist
@@ -306,7 +330,7 @@ def _moved(
 
 
 def _tightened(
-    surface: _Surface,
+    surface: Surface,
     centres: Float[np.ndarray, "n 3"],
     reach: Float[np.ndarray, "n t"],
     radius: Float[np.ndarray, "n"],
@@ -329,7 +353,7 @@ def _tightened(
     return spheres, float((radius + surface.signed(centres))[kept].max())
 
 
-def _filled_up(surface: _Surface, spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 4"]:
+def _filled_up(surface: Surface, spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 4"]:
     """Add spheres inside until every cell that no surface reaches is held."""
     index = np.argwhere(surface.whole)
     middles = surface.lower + surface.cell * (index + 0.5)
