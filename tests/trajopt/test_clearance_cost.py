@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.small_scenes import at
 
@@ -35,6 +35,7 @@ def values(field, points):
     return field(torch.from_numpy(points)[:, None], columns)[:, 0].numpy()
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 40))
 def test_the_spline_never_says_farther_than_it_promises(seed):
     """D^2 <= d^2 + 3 h^2 / 4 against brute force, inside the grid and outside."""
@@ -120,9 +121,9 @@ def test_deep_inside_there_is_a_way_out(cost_world, ball, crate):
     assert before.min() > 0.0
     assert (steep > 0.0).all()  # small only where two ways out are equally long
     assert (steep > 0.4).float().mean() > 0.97
-    for _ in range(400):
+    for _ in range(250):
         (grad,) = torch.autograd.grad(cost(q).sum(), q)
-        q = (q.detach() - 0.003 * grad).requires_grad_()
+        q = (q.detach() - 0.004 * grad).requires_grad_()
     checker = vp.CollisionChecker(cost_world, ball)
     assert checker.clearance_batch(q.detach()[:, 0].numpy()).min() > -0.002
 
