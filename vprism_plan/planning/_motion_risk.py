@@ -37,7 +37,8 @@ class MotionRisk:
         survival: -log(1 - p(q)), p the share of the checker's posterior worlds in which the
             robot touches anything; a bound from above of the marginal that
             `checker.collision_probability(q)` gives.
-        occupancy: sum over the spheres of the largest P(occupied) found in each.
+        occupancy: sum over the spheres of the largest P(occupied) found in each; at voxels
+            about which the posterior worlds agree it counts as 0 or 1.
         entropy: mean entropy, nats, of the map in the volume of the moving spheres. Only
             where posterior worlds can differ; elsewhere the map is certain, or has no support.
 

@@ -194,7 +194,8 @@ class VPrismRiskObjective(_RiskBase):
             robot touches anything at q. What touches one object over 10 cm costs ten times
             what touches it over 1 cm, although the risk may be the same.
         "occupancy": integral of the sum over spheres of the largest P(occupied) in each.
-        "entropy": integral of the mean entropy in the robot's volume, nats.
+        "entropy": integral of the mean entropy in the robot's volume, nats. Both know no
+            allowed contacts, and are 0 (occupancy: or 1) where all posterior worlds agree.
         a function: integral of its values, (n, dof) -> (n,), over joint-space length.
 
     Metres are those of the sphere that moves farthest (an upper bound). `MotionRisk` says how
