@@ -16,6 +16,7 @@ from vprism_plan.robots import Robot
 from vprism_plan.world.rasterize import winding_number
 
 LinkShapes = Literal["geometry", "spheres"]
+_MOST_PIECES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +65,8 @@ def robot_solids(
 
     Args:
         robot: the robot.
-        links: "geometry" (a mesh of `link_meshes`, else the URDF's primitives, else the
-            spheres) or "spheres".
+        links: "geometry" (a mesh of `link_meshes`, else the URDF's meshes and primitives,
+            else the spheres) or "spheres".
         link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres.
 
     Raises:
@@ -84,16 +85,16 @@ def robot_solids(
     if meshes and links == "spheres":
         raise ConfigError("link_meshes are given but links is 'spheres'; use links='geometry'")
     in_link = _spheres_in_links(robot)
-    partial = set(robot.links_with_meshes)
+    unread = set(robot.links_with_meshes)
     solids: list[Solid] = []
     for index, name in enumerate(robot.link_names):
         if links == "geometry" and name in meshes:
             solids += _mesh_solids(index, name, meshes[name])
-        elif links == "geometry" and name in robot.geometry and name not in partial:
-            solids += [
-                _primitive(index, -1, s.kind, s.size, s.T_link, s.padding)
-                for s in robot.geometry[name]
-            ]
+        elif links == "geometry" and (pieces := _own_meshes(robot, name)) is not None:
+            solids += [solid for mesh in pieces for solid in _mesh_solids(index, name, mesh)]
+            solids += _primitives(robot, index)
+        elif links == "geometry" and name in robot.geometry and name not in unread:
+            solids += _primitives(robot, index)
         else:
             for sphere in np.flatnonzero(robot.sphere_links == index):
                 pose = np.eye(4)
@@ -102,6 +103,28 @@ def robot_solids(
                 radius = (float(robot.sphere_radii[sphere]) - padding,)
                 solids.append(_primitive(index, int(sphere), "sphere", radius, pose, padding))
     return solids
+
+
+def _own_meshes(robot: Robot, name: str) -> list[Any] | None:
+    """The URDF's meshes of a link; None if it has none that can stand for it.
+
+    Files that are missing, links that were padded or scaled, and meshes in so many pieces that
+    each triangle would be a solid of its own are left to the spheres, which hold them.
+    """
+    files = robot.meshes.get(name, ())
+    if not files or any(file.path is None for file in files):
+        return None
+    meshes = [file.mesh() for file in files]
+    if sum(mesh.body_count for mesh in meshes) > _MOST_PIECES:
+        return None
+    return meshes
+
+
+def _primitives(robot: Robot, link: int) -> list[Solid]:
+    return [
+        _primitive(link, -1, s.kind, s.size, s.T_link, s.padding)
+        for s in robot.geometry.get(robot.link_names[link], ())
+    ]
 
 
 def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:

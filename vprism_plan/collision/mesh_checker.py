@@ -49,9 +49,10 @@ class MeshChecker:
     Args:
         world: what to avoid.
         robot: whose configurations are asked about.
-        links: "geometry": the URDF's boxes, cylinders and spheres, or `link_meshes`, and
-            the collision spheres of links that have neither (or whose URDF also has
-            meshes, which are not read). "spheres": the collision spheres of every link.
+        links: "geometry": the URDF's meshes, boxes, cylinders and spheres, or `link_meshes`,
+            and the collision spheres of links that have neither (or whose meshes are missing,
+            in more than 20 pieces, or of a link that was padded or scaled). "spheres": the
+            collision spheres of every link.
         link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres, in place of its
             primitives. They are taken as they are: the robot's padding does not grow them.
         allowed_contacts: link or SRDF group -> ids of the objects that it may touch.
