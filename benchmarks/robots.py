@@ -130,7 +130,8 @@ def picture(robots: dict[str, Robot], path: Path) -> None:
     sheet = [
         np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows
     ]
-    Image.fromarray(np.concatenate(sheet)).save(path, optimize=True)
+    whole = Image.fromarray(np.concatenate(sheet))
+    whole.resize((1700, 1700 * whole.height // whole.width)).save(path, optimize=True)
 
 
 def main() -> None:
