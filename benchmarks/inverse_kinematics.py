@@ -77,9 +77,7 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=30)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    print(
-        "robot | solver | poses solved | distinct | ms per pose | worst mm | worst mrad | beyond limits"
-    )
+    print("robot | solver | poses solved | distinct | ms per pose | worst mm | worst mrad | beyond")
     for name, link in LINKS.items():
         robot = vp.Robot.from_urdf(urdf_path(name))
         rng = np.random.default_rng(0)
