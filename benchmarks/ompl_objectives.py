@@ -283,7 +283,6 @@ def text(table: list[dict], rates: dict[str, float], scenes: int) -> str:
         "- *cold*: without RRTConnect's path to begin with and without samples around the best "
         "path. *worst*: the worst state of the path counts alone. *s*: all of `plan`, with the "
         "worlds that the first query with an objective draws and bakes.",
-        "- Rows with fewer problems were asked the first ones of each scene only.",
         "",
         "| contender | solved | risk lowered | median risk | worst risk | below 1 % | rad | s |",
         "|---|---|---|---|---|---|---|---|",
