@@ -79,7 +79,9 @@ def _lines(robot: "Robot", report: "RobotReport", often: list[tuple[str, str, fl
     verdict = {
         True: "every link is proved to be enclosed",
         False: "NOT every link is enclosed: what is bare is not checked",
-        None: "some meshes are missing, so nothing is known of their links",
+        None: "some meshes are missing, so nothing is known of their links"
+        if any(link.missing for link in report.links)
+        else "unknown whether they enclose the links: there is no geometry to compare with",
     }[report.enclosed]
     return [
         f"{robot.name}: {robot.dof} joints ({', '.join(robot.joint_names)}){locked}",

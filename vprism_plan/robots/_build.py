@@ -69,6 +69,8 @@ def robot_fields(request: Request) -> tuple[dict[str, Any], dict[str, float]]:
         disabled = dict(semantics.disabled) | _touching_fits(arrays, pairs, chosen)
     kept = [frozenset((names[a], names[b])) not in disabled for a, b in pairs]
     arrays = dataclasses.replace(arrays, pairs=np.ascontiguousarray(pairs[kept]))
+    solids = {n: link.primitives for n, link in model.links.items() if link.primitives}
+    meshes = {n: link.meshes for n, link in model.links.items() if link.meshes}
     fields = {
         "name": model.name,
         "joint_names": active,
@@ -76,15 +78,17 @@ def robot_fields(request: Request) -> tuple[dict[str, Any], dict[str, float]]:
         "velocity_limits": np.array([model.joint_map[j].velocity for j in active]),
         "base_pose": base,
         "link_names": names,
-        "geometry": {n: link.primitives for n, link in model.links.items() if link.primitives},
+        "geometry": solids,
         "named_states": _states(semantics, active),
         "groups": dict(semantics.group_links),
         "disabled_pairs": disabled,
         "arrays": arrays,
         "_links": links,
         "_torch": TorchKinematics(arrays),
-        "links_with_meshes": tuple(n for n, link in model.links.items() if link.meshes),
-        "meshes": {n: link.meshes for n, link in model.links.items() if link.meshes},
+        "links_with_meshes": tuple(meshes),
+        "meshes": meshes,
+        "geometry_as_read": solids,
+        "meshes_as_read": meshes,
         "link_spheres": chosen.rows,
         "sphere_sources": chosen.sources,
     }

@@ -74,9 +74,11 @@ class RobotReport:
 
     @property
     def enclosed(self) -> bool | None:
-        """Whether all links are proved to be enclosed; None where a link's mesh is missing."""
+        """Whether all links are proved to be enclosed; None where a link's mesh is missing, and
+        where no link has geometry to compare with.
+        """
         known = [link.enclosed for link in self.links if link.geometry]
-        return False if False in known else None if None in known else True
+        return False if False in known else True if known and None not in known else None
 
     @property
     def protrusion(self) -> float:
@@ -128,7 +130,7 @@ def _row(link: LinkReport) -> tuple[str, ...]:
 
 def robot_report(robot: Any) -> RobotReport:
     """See :meth:`Robot.report`."""
-    shaped = (*robot.geometry, *robot.links_with_meshes)
+    shaped = (*robot.geometry_as_read, *robot.meshes_as_read)
     names = [
         *robot.link_spheres,
         *(name for name in dict.fromkeys(shaped) if name not in robot.link_spheres),
@@ -144,7 +146,7 @@ def robot_report(robot: Any) -> RobotReport:
 
 
 def _link_report(robot: Any, name: str) -> LinkReport:
-    solids, meshes = robot.geometry.get(name, ()), robot.meshes.get(name, ())
+    solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
     rows = robot.link_spheres.get(name, np.empty((0, 4)))
     missing = tuple(mesh.filename for mesh in meshes if mesh.path is None)
     source = robot.sphere_sources.get(name, "-")

@@ -64,6 +64,9 @@ class Robot:
             spheres as they were read or fitted, without padding, scale and attached objects.
         sphere_sources: Link name -> where its spheres are from: "file", "urdf", "tiled"
             over boxes and cylinders, or "fitted".
+        geometry_as_read: ``geometry`` without padding and scale: what belongs to
+            ``link_spheres``.
+        meshes_as_read: ``meshes`` of all links, scaled and padded ones too.
         attached: Name of each attached object -> the link that carries it.
     """
 
@@ -84,6 +87,10 @@ class Robot:
     meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     link_spheres: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     sphere_sources: dict[str, str] = field(default_factory=dict, repr=False)
+    geometry_as_read: dict[str, tuple[PrimitiveGeometry, ...]] = field(
+        default_factory=dict, repr=False
+    )
+    meshes_as_read: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
 
     @classmethod

@@ -23,8 +23,8 @@ def robot_figure(robot: "Robot", q: Any = None, *, title: str | None = None) -> 
     """Draw a robot's collision geometry, and its spheres over it, link by link.
 
     Args:
-        robot: Attached objects and padding are drawn; links whose mesh files are missing
-            are drawn by their spheres only.
+        robot: Attached objects are drawn, padding and scale are not: both are as they were
+            read. Links whose mesh files are missing are drawn by their spheres only.
         q: (dof,) configuration; None is `robot.neutral`.
         title: Above both views; None: the robot's name and how many spheres it has.
 
@@ -33,8 +33,8 @@ def robot_figure(robot: "Robot", q: Any = None, *, title: str | None = None) -> 
     """
     q = robot.neutral if q is None else robot.check_configuration(q)
     parts = _geometry(robot, q)
-    centers = _sphere_centers(robot, q)
-    film = _film(robot, parts, centers)
+    centers, radii, owners = _spheres(robot, q)
+    film = _film(robot, parts, centers, radii)
     bare, over = np.ones((film.height, film.width, 3)), Layer(film)
     solid = Layer(film)
     for triangles, normals in parts:
@@ -42,8 +42,8 @@ def robot_figure(robot: "Robot", q: Any = None, *, title: str | None = None) -> 
     there = np.isfinite(solid.depth)
     bare[there] = solid.shaded()[there]
     for link in range(len(robot.link_names)):
-        mine = np.asarray(robot.sphere_links) == link
-        over.add_spheres(centers[mine], robot.sphere_radii[mine], PALETTE[link % len(PALETTE)])
+        mine = owners == link
+        over.add_spheres(centers[mine], radii[mine], PALETTE[link % len(PALETTE)])
     covered = bare.copy()
     seen = np.isfinite(over.depth)
     weight = np.where(over.edges(), _OUTLINE, _CLEAR)[seen][:, None]
@@ -60,11 +60,22 @@ def robot_figure(robot: "Robot", q: Any = None, *, title: str | None = None) -> 
     return figure
 
 
-def _sphere_centers(robot: "Robot", q: np.ndarray) -> np.ndarray:
+def _spheres(robot: "Robot", q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """World centres, radii and links' indices, without padding and scale."""
     import torch
 
     with torch.no_grad():
-        return robot.sphere_centers(torch.as_tensor(q, dtype=torch.float64)).numpy()
+        checked = robot.sphere_centers(torch.as_tensor(q, dtype=torch.float64)).numpy()
+    poses = robot.link_poses(q)
+    parts = []
+    for index, link in enumerate(robot.link_names):
+        mine = np.asarray(robot.sphere_links) == index
+        centers, radii = checked[mine], robot.sphere_radii[mine]
+        if link in robot.link_spheres:  # all but attached objects
+            T, rows = poses[link], robot.link_spheres[link]
+            centers, radii = rows[:, :3] @ T[:3, :3].T + T[:3, 3], rows[:, 3]
+        parts.append((centers, radii, np.full(len(radii), index)))
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))  # type: ignore[return-value]
 
 
 def _geometry(robot: "Robot", q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -74,8 +85,10 @@ def _geometry(robot: "Robot", q: np.ndarray) -> list[tuple[np.ndarray, np.ndarra
     poses = robot.link_poses(q)
     parts = []
     for link, T in poses.items():
-        meshes = [mesh.mesh() for mesh in robot.meshes.get(link, ()) if mesh.path is not None]
-        for solid in robot.geometry.get(link, ()):
+        meshes = [
+            mesh.mesh() for mesh in robot.meshes_as_read.get(link, ()) if mesh.path is not None
+        ]
+        for solid in robot.geometry_as_read.get(link, ()):
             triangles = solid.triangles()
             meshes.append(trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=True))
         for mesh in meshes:
@@ -101,9 +114,14 @@ def _corners(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _film(robot: "Robot", parts: list[tuple[np.ndarray, np.ndarray]], centers: np.ndarray) -> Film:
+def _film(
+    robot: "Robot",
+    parts: list[tuple[np.ndarray, np.ndarray]],
+    centers: np.ndarray,
+    radii: np.ndarray,
+) -> Film:
     around = np.concatenate([np.eye(3), -np.eye(3)])
-    ends = centers[:, None] + np.asarray(robot.sphere_radii)[:, None, None] * around
+    ends = centers[:, None] + radii[:, None, None] * around
     points = np.concatenate([ends.reshape(-1, 3), *(part.reshape(-1, 3) for part, _ in parts)])
     low, high = points.min(axis=0), points.max(axis=0)
     middle = 0.5 * (low + high)
