@@ -50,3 +50,21 @@ def test_a_link_of_two_equal_spheres_can_be_reported(write):
     text = chain(joint("j1", "a", "b"), links=("a",)).replace("</robot>", "")
     report = Robot.from_urdf(write(text + twice.format("b") + "</robot>")).report()
     assert {link.link: link.enclosed for link in report.links} == {"a": True, "b": True}
+
+
+def test_a_link_without_spheres_is_named_as_unchecked(write, tmp_path, capsys, caplog):
+    path = write(TWO)
+    table = {"a": BIG, "b": [], "c": BIG}
+    robot = Robot.from_urdf(path, spheres=table)
+    report = robot.report()
+    assert report.enclosed is False
+    (row,) = (link for link in report.links if link.link == "b")
+    assert (row.enclosed, row.coverage, row.unchecked) == (False, 0.0, True)
+    assert "NOT CHECKED" in report.text()
+    assert not caplog.records  # an empty list in our own file is on purpose
+    robot.write_spheres(tmp_path / "arm_spheres.yml")
+    assert main(["robot", str(path)]) == 0
+    assert "no spheres at all: b" in capsys.readouterr().out
+    Robot.from_urdf(path, spheres={"kinematics": {"collision_spheres": table}})
+    assert "without spheres" in caplog.text
+    assert "['b']" in caplog.text

@@ -76,9 +76,11 @@ def _lines(robot: "Robot", report: "RobotReport", often: list[tuple[str, str, fl
     locked = f"; locked: {', '.join(robot.locked)}" if robot.locked else ""
     reasons = Counter(reason or "no reason given" for *_, reason in report.disabled_pairs)
     counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
+    unchecked = ", ".join(link.link for link in report.links if link.unchecked)
     verdict = {
         True: "every link is proved to be enclosed",
-        False: "NOT every link is enclosed: what is bare is not checked",
+        False: "NOT every link is enclosed: what is bare is not checked"
+        + (f" (no spheres at all: {unchecked})" if unchecked else ""),
         None: "some meshes are missing, so nothing is known of their links"
         if any(link.missing for link in report.links)
         else "unknown whether they enclose the links: there is no geometry to compare with",

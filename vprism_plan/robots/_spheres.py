@@ -87,16 +87,19 @@ def link_spheres(
                 f"{table.source} gives spheres for the unknown link '{link}'; "
                 f"links: {list(model.links)}"
             )
-    bare = tuple(
-        name
-        for name, link in model.links.items()
-        if name not in known and (link.primitives or link.meshes)
-    )
+    bare = tuple(name for name in model.links if name not in known and _has_geometry(model, name))
     if bare and not table.foreign:
         raise RobotError(
             f"{table.source} gives no spheres for the links {list(bare)}, which have collision "
             "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
             "on purpose"
+        )
+    emptied = [name for name, rows in known.items() if not len(rows) and _has_geometry(model, name)]
+    if emptied and table.foreign:
+        _logger.warning(
+            "%s leaves the links %s without spheres; they have collision geometry and are not "
+            "checked",
+            *(table.source, emptied),
         )
     rest = _from_geometry(model, bare, fit)
     if rest.rows:
@@ -111,6 +114,10 @@ def link_spheres(
         {name: sources[name] for name in order},
         table.padding,
     )
+
+
+def _has_geometry(model: RobotModel, name: str) -> bool:
+    return bool(model.links[name].primitives or model.links[name].meshes)
 
 
 def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) -> ChosenSpheres:

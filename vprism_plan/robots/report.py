@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,7 @@ class LinkReport:
         geometry: What the URDF has, in words.
         missing: Mesh files that are not there; then nothing below is known.
         enclosed: Whether every point of its surface is proved to lie in the spheres; None
-            without geometry.
+            without geometry. False for geometry without a sphere: that is not checked at all.
         coverage: Share of 4000 points of the surface, uniform by area, that do; or None.
         bare: How far the farthest of these is from the spheres, metres; 0 if all are inside.
         protrusion: How far the spheres stand out of the link at most, metres, measured on
@@ -47,6 +47,11 @@ class LinkReport:
     bare: float | None = None
     protrusion: float | None = None
     mean_protrusion: float | None = None
+
+    @property
+    def unchecked(self) -> bool:
+        """Whether it has geometry and no sphere."""
+        return bool(self.geometry) and self.spheres == 0
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,9 @@ def _row(link: LinkReport) -> tuple[str, ...]:
     def millimetres(value: float | None) -> str:
         return "-" if value is None else f"{1000.0 * value:.1f} mm"
 
-    if link.enclosed is None:
+    if link.unchecked:
+        verdict = "NOT CHECKED"
+    elif link.enclosed is None:
         verdict = "mesh missing" if link.missing else "no geometry"
     else:
         verdict = "proved" if link.enclosed else f"no, {1000.0 * (link.bare or 0.0):.1f} mm bare"
@@ -151,7 +158,9 @@ def _link_report(robot: Any, name: str) -> LinkReport:
     missing = tuple(mesh.filename for mesh in meshes if mesh.path is None)
     source = robot.sphere_sources.get(name, "-")
     stated = LinkReport(name, len(rows), source, _described(solids, meshes), missing)
-    if missing or not (solids or meshes) or len(rows) == 0:
+    if (solids or meshes) and len(rows) == 0:
+        return replace(stated, enclosed=False, coverage=0.0)
+    if missing or not (solids or meshes):
         return stated
     held = [solid for solid in solids if solid.kind == "sphere" and _in_one(solid, rows)]
     rest = [solid for solid in solids if solid not in held]
