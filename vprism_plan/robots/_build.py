@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +64,12 @@ def robot_fields(request: Request) -> tuple[dict[str, Any], dict[str, float]]:
     names = tuple(chosen.rows)
     pairs = _self_collision.candidate_pairs(model, links, names, semantics.disabled)
     if srdf is None:
-        disabled = _generated(model, arrays, pairs, names, request.matrix_samples)
+        sampled = _sampled(arrays, pairs, names, request.matrix_samples)
     else:
-        disabled = dict(semantics.disabled) | _touching_fits(arrays, pairs, chosen)
+        sampled = _touching_fits(arrays, pairs, chosen)
+    disabled = dict(semantics.disabled) | sampled
+    for pair, why in _built_so(model, arrays, names).items():
+        disabled.setdefault(pair, why)
     kept = [frozenset((names[a], names[b])) not in disabled for a, b in pairs]
     arrays = dataclasses.replace(arrays, pairs=np.ascontiguousarray(pairs[kept]))
     solids = {n: link.primitives for n, link in model.links.items() if link.primitives}
@@ -89,6 +92,7 @@ def robot_fields(request: Request) -> tuple[dict[str, Any], dict[str, float]]:
         "meshes": meshes,
         "geometry_as_read": solids,
         "meshes_as_read": meshes,
+        "_sampled_pairs": {pair: _hangs_on(model, fixed_values, pair) for pair in sampled},
         "link_spheres": chosen.rows,
         "sphere_sources": chosen.sources,
     }
@@ -103,24 +107,41 @@ def _states(semantics: SemanticModel, active: tuple[str, ...]) -> dict[str, np.n
     }
 
 
-def _generated(
-    model: RobotModel,
+def _sampled(
     arrays: KinematicArrays,
     pairs: Int[np.ndarray, "pairs 2"],
     names: tuple[str, ...],
     samples: int,
 ) -> dict[frozenset[str], str]:
-    """Pairs not to test where there is no SRDF, with the reason for each."""
+    """Pairs that random configurations show not to need a test, where there is no SRDF."""
     if samples < 1:
         raise RobotError(f"matrix_samples is {samples}; at least 1 configuration is needed")
-    reasons = dict.fromkeys(_rigid_pairs(arrays, names), _matrix.RIGID)
-    adjacent = _self_collision.adjacent_pairs(model, set(names))
-    reasons |= dict.fromkeys(sorted(adjacent, key=sorted), _matrix.ADJACENT)
     sampled = _matrix.sampled_reasons(arrays, pairs, names, samples)
     always = [tuple(sorted(pair)) for pair, why in sampled.items() if why == _matrix.ALWAYS]
     if always:
         _logger.warning("not tested for self-collision, their spheres always overlap: %s", always)
-    return reasons | sampled
+    return sampled
+
+
+def _built_so(
+    model: RobotModel, arrays: KinematicArrays, names: tuple[str, ...]
+) -> dict[frozenset[str], str]:
+    """The pairs that are never candidates, SRDF or not, with the reason for each."""
+    adjacent = _self_collision.adjacent_pairs(model, set(names))
+    reasons = dict.fromkeys(_rigid_pairs(arrays, names), _matrix.RIGID)
+    return reasons | dict.fromkeys(sorted(adjacent, key=sorted), _matrix.ADJACENT)
+
+
+def _hangs_on(model: RobotModel, joints: Collection[str], pair: frozenset[str]) -> bool:
+    """Whether any of these joints, or one that mimics it, moves two links against each other."""
+    above = {joint.child: joint for joint in model.joints}
+    between: set[str] = set()
+    for end in pair:
+        link = end
+        while link in above:
+            between ^= {above[link].name}  # what is above both moves neither against the other
+            link = above[link].parent
+    return any(model.resolve_mimic(name)[0] in joints for name in between)
 
 
 def _rigid_pairs(arrays: KinematicArrays, names: tuple[str, ...]) -> list[frozenset[str]]:

@@ -6,16 +6,17 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._arrays import KinematicArrays
 from vprism_plan.robots._frames import bounding_ball
 from vprism_plan.robots._geometry import PrimitiveGeometry
+from vprism_plan.robots._matrix import NEVER
 from vprism_plan.robots._self_collision import touching_pairs
 from vprism_plan.robots._torch_kinematics import TorchKinematics
 
@@ -30,6 +31,13 @@ def padded(
     pads = per_link(padding, 0.0, "padding", names, robot.links_of)
     scales = per_link(scale, 1.0, "scale", names, robot.links_of)
     arrays = grown(robot.arrays, scales, pads)
+    larger = {name for name, factor in zip(names, scales, strict=True) if factor > 1.0}
+    again = [
+        pair
+        for pair in robot._sampled_pairs
+        if robot.disabled_pairs.get(pair) == NEVER and pair & larger
+    ]
+    arrays = dataclasses.replace(arrays, pairs=_with_pairs(arrays.pairs, again, names))
     geometry = dict(robot.geometry)
     for index, name in enumerate(names):
         if name in geometry:
@@ -46,11 +54,21 @@ def padded(
     return dataclasses.replace(
         robot,
         arrays=arrays,
+        disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if p not in again},
         geometry=geometry,
         # Nothing grows a mesh; who wants solids takes the spheres, which did grow.
         meshes={name: files for name, files in robot.meshes.items() if name not in changed},
         _torch=TorchKinematics(arrays),
     )
+
+
+def _with_pairs(
+    pairs: Int[np.ndarray, "pairs 2"], again: Sequence[frozenset[str]], names: tuple[str, ...]
+) -> Int[np.ndarray, "more 2"]:
+    """Pairs with others added: "Never" was found for links of another size."""
+    added = [sorted(names.index(name) for name in pair) for pair in again]
+    both = np.vstack([pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
+    return np.ascontiguousarray(both[np.lexsort((both[:, 1], both[:, 0]))])
 
 
 def per_link(

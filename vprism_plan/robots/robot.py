@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,13 @@ from vprism_plan.robots import _attached, _frames, _padding
 from vprism_plan.robots._arrays import KinematicArrays
 from vprism_plan.robots._build import Request, robot_fields
 from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._matrix import SAMPLES, shares_touching, srdf_text, write_srdf_text
+from vprism_plan.robots._matrix import (
+    RIGID,
+    SAMPLES,
+    shares_touching,
+    srdf_text,
+    write_srdf_text,
+)
 from vprism_plan.robots._mesh_files import MeshFile, PackageDirs
 from vprism_plan.robots._setup import rigid_pose
 from vprism_plan.robots._sphere_files import write_spheres
@@ -32,6 +39,7 @@ if TYPE_CHECKING:
     import torch
 
 READY = "ready"
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +60,10 @@ class Robot:
         named_states: SRDF states that fix every joint of ``joint_names``.
         groups: SRDF group -> names of its links: the children of its joints and the links
             it names, with or without spheres (:meth:`links_of` gives those with spheres).
-        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's, a
-            generated one ("Adjacent", "Rigid", "Always", "Never"), or what :meth:`attach`
-            was told.
+        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's; with
+            an SRDF or without, "Adjacent" for links joined by a joint (also through links
+            without spheres) and "Rigid" for links that no joint moves against each other;
+            "Always" and "Never" of random configurations; or what :meth:`attach` was told.
         arrays: The flat form that compiled kernels read.
         links_with_meshes: Links whose collision geometry has meshes: what ``geometry``
             holds of them is not the whole link.
@@ -91,6 +100,8 @@ class Robot:
         default_factory=dict, repr=False
     )
     meshes_as_read: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
+    # Pairs disabled by random configurations -> whether the values of locked joints enter.
+    _sampled_pairs: dict[frozenset[str], bool] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -344,6 +355,7 @@ class Robot:
         shape's own origin; its padding moves each face of a box outward, corners farther,
         where ours is a distance in every direction; and it leaves the scale out of
         self-collision, where ours counts (pairs that then touch at ``neutral`` are logged).
+        A scale above 1 makes generated "Never" pairs of that link tested again.
 
         Args:
             padding: Metres, 0 or more: one number, or a table by link or group whose other
@@ -441,13 +453,29 @@ class Robot:
 
     def write_srdf(self, path: str | Path) -> None:
         """Write an SRDF: the configuration's joints as group "arm", other groups, named
-        states, the values of locked joints, and every disabled pair with its reason.
+        states, the values of locked joints, and disabled pairs with their reasons.
+
+        Left out are "Rigid" pairs, which are found anew when it is read, and, with a warning,
+        generated "Always" and "Never" pairs that a locked joint moves against each other: an
+        SRDF holds for any joints, what was sampled for these values only.
         """
         states = {
             name: dict(zip(self.joint_names, map(float, q), strict=True))
             for name, q in self.named_states.items()
         }
-        of_urdf = {p: why for p, why in self.disabled_pairs.items() if not p & set(self.attached)}
+        of_urdf = {
+            pair: why
+            for pair, why in self.disabled_pairs.items()
+            if why != RIGID and not pair & set(self.attached)
+        }
+        passing = [p for p in of_urdf if self._sampled_pairs.get(p)]
+        if passing:
+            _logger.warning(
+                "not written to '%s', as they were found for these values of locked joints only "
+                "(%s): %s; to write them, read the robot with all joints in joints=",
+                *(path, self.locked, sorted(map(sorted, passing))),
+            )
+        of_urdf = {pair: why for pair, why in of_urdf.items() if pair not in passing}
         write_srdf_text(
             path, srdf_text(self.name, self.joint_names, self.groups, states, self.locked, of_urdf)
         )
