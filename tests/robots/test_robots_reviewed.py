@@ -2,10 +2,12 @@
 """What went wrong once, in silence: each test is named after what broke."""
 
 import pytest
-from small_urdfs import LINK, TWO, chain, joint
+from small_urdfs import LIMIT, LINK, TWO, chain, joint
 
 from vprism_plan.cli import main
+from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot
+from vprism_plan.robots._mesh_files import find_mesh
 
 BIG = [{"center": [0, 0, 0], "radius": 0.06}]
 SMALL = [{"center": [0, 0, 0], "radius": 0.03}]
@@ -68,3 +70,125 @@ def test_a_link_without_spheres_is_named_as_unchecked(write, tmp_path, capsys, c
     Robot.from_urdf(path, spheres={"kinematics": {"collision_spheres": table}})
     assert "without spheres" in caplog.text
     assert "['b']" in caplog.text
+
+
+def pair(a, b):
+    return frozenset((a, b))
+
+
+RIGID_TIP = joint("fixed", "c", "d", kind="fixed", limit="")
+FOUR = chain(joint("j1", "a", "b"), joint("j2", "b", "c"), RIGID_TIP, links=("a", "b", "c", "d"))
+
+
+def test_with_an_srdf_every_pair_is_tested_or_has_a_reason(write, urdf_folder):
+    srdf = write('<robot name="chain"><disable_collisions link1="a" link2="b"/></robot>', "x.srdf")
+    robot = Robot.from_urdf(write(FOUR), srdf=srdf)
+    assert robot.disabled_pairs[pair("a", "b")] == ""  # the SRDF's own word stands
+    assert robot.disabled_pairs[pair("b", "c")] == "Adjacent"
+    assert robot.disabled_pairs[pair("c", "d")] == "Adjacent"
+    locked = Robot.from_urdf(write(FOUR), srdf=srdf, joints=["j1"])
+    assert locked.disabled_pairs[pair("b", "d")] == "Rigid"
+    for one in (robot, locked, Robot.from_urdf(urdf_folder / "panda.urdf")):
+        names = one.link_names
+        tested = {pair(names[a], names[b]) for a, b in one.collision_pairs}
+        every = {pair(a, b) for a in names for b in names if a != b}
+        assert tested | set(one.disabled_pairs) >= every
+        assert not tested & set(one.disabled_pairs)
+
+
+def test_a_written_srdf_holds_for_other_values_of_locked_joints(write, tmp_path, caplog):
+    """Locked at 0, the tip never comes near the base; locked at pi, it is on it."""
+    wide = '<limit lower="-4" upper="4" effort="1" velocity="1"/>'
+    path = write(
+        chain(
+            joint("j1", "a", "b"),
+            joint("j2", "b", "c", axis="0 1 0", limit=wide),
+            joint("j3", "c", "d", limit=LIMIT),
+            links=("a", "b", "c", "d"),
+        )
+    )
+    first = Robot.from_urdf(path, joints=["j1", "j3"])
+    assert first.disabled_pairs[pair("a", "d")] == "Never"
+    assert first.disabled_pairs[pair("a", "c")] == "Never"
+    assert first.disabled_pairs[pair("b", "c")] == "Adjacent"
+    first.write_srdf(tmp_path / "out.srdf")
+    assert "locked joints only" in caplog.text
+    again = Robot.from_urdf(
+        path, srdf=tmp_path / "out.srdf", joints=["j1", "j3"], locked={"j2": 3.1}
+    )
+    tested = {pair(again.link_names[a], again.link_names[b]) for a, b in again.collision_pairs}
+    assert {pair("a", "c"), pair("a", "d")} <= tested
+
+
+def test_rigid_pairs_are_not_written(write, tmp_path):
+    path = write(FOUR)
+    Robot.from_urdf(path, joints=["j1"]).write_srdf(tmp_path / "out.srdf")
+    assert "Rigid" not in (tmp_path / "out.srdf").read_text()
+    again = Robot.from_urdf(path, srdf=tmp_path / "out.srdf", joints=["j1", "j2"])
+    assert len(again.collision_pairs) > 0
+
+
+def test_never_pairs_are_tested_once_a_scale_makes_links_larger(write):
+    far = {"xyz": "0 0 0.3", "axis": "0 0 1"}
+    path = write(chain(joint("j1", "a", "b", **far), joint("j2", "b", "c", **far)))
+    robot = Robot.from_urdf(path)
+    assert robot.disabled_pairs[pair("a", "c")] == "Never"
+    assert len(robot.collision_pairs) == 0
+    for same in (robot.with_padding(0.5), robot.with_padding(scale=0.5)):
+        assert same.disabled_pairs == robot.disabled_pairs
+    for large in (robot.with_padding(scale={"a": 13.0}), robot.with_padding(scale=7.0)):
+        assert pair("a", "c") not in large.disabled_pairs
+        assert large.collision_pairs.tolist() == [[0, 2]]
+        assert set(large.touching_shares(10).values()) == {1.0}
+
+
+MESH = (
+    '<robot name="r"><link name="base"/><link name="tip"><collision><geometry>'
+    '<mesh filename="{}"/></geometry></collision></link><joint name="j" type="continuous">'
+    '<parent link="base"/><child link="tip"/><axis xyz="0 0 1"/></joint></robot>'
+)
+PYRAMID = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 {}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def ascii_stl(corner: str) -> str:
+    faces = [("0 0 0", "0.1 0 0", "0 0.1 0"), ("0 0 0", "0.1 0 0", corner)]
+    body = "".join(
+        "facet normal 0 0 1\nouter loop\n"
+        + "".join(f"vertex {point}\n" for point in face)
+        + "endloop\nendfacet\n"
+        for face in faces
+    )
+    return f"solid s\n{body}endsolid s\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("m.obj", PYRAMID.format("nan")), ("m.stl", ascii_stl("0 0 nan"))]
+)
+def test_vertices_that_are_not_finite_are_refused_and_not_cut_out(write, arm, name, text):
+    file = write(text, name)
+    with pytest.raises(RobotError, match=rf"link 'tip', .*{name}'.*not finite"):
+        Robot.from_urdf(write(MESH.format(name)))
+    with pytest.raises(RobotError, match=rf"{name}'.*not finite"):
+        arm.attach("tool", "c", mesh=file)
+
+
+def test_a_mesh_without_area_is_refused(write):
+    write("v 0 0 0\nv 0.1 0.1 0.1\nv 0.3 0.3 0.3\nf 1 2 3\n", "line.obj")
+    with pytest.raises(RobotError, match=r"link 'tip', .*line.obj'.* no area"):
+        Robot.from_urdf(write(MESH.format("line.obj")))
+
+
+def test_another_packages_file_is_not_taken_in_silence(tmp_path, caplog):
+    mine = tmp_path / "mine"
+    (mine / "meshes").mkdir(parents=True)
+    (mine / "meshes" / "m.obj").write_text(PYRAMID.format(0.1))
+    urdf, name = mine / "r.urdf", "package://other/meshes/m.obj"
+    assert find_mesh(name, urdf, None)[0] == mine / "meshes" / "m.obj"
+    assert "'package://other/meshes/m.obj'" in caplog.text
+    caplog.clear()
+    assert find_mesh("package://mine/meshes/m.obj", urdf, None)[0] is not None
+    (tmp_path / "ros" / "other").mkdir(parents=True)
+    ros = tmp_path / "ros"
+    for dirs in ({"other": ros / "other"}, ros, [ros / "other"]):
+        assert find_mesh(name, urdf, dirs)[0] is None
+    assert not caplog.records

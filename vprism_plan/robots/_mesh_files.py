@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +19,9 @@ from vprism_plan.robots._mesh_spheres import read_triangles
 
 # No link is longer, metres: such a mesh is in millimetres.
 _MAX_EXTENT = 20.0
+# What rounding makes of triangles without any, as a share of the extent squared.
+_NO_AREA = 1e-12
+_logger = logging.getLogger(__name__)
 
 PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | None
 """Where packages are: folders that hold them (or are them), or package -> its folder."""
@@ -67,6 +72,8 @@ class MeshFile:
 
         what = f"link '{self.link}'"
         loaded = _loaded(self.require(), what)
+        what = f"{what}, '{self.path}'"
+        read_triangles(loaded, what, math.inf)  # before merging, which is for finite vertices
         # Readers keep vertices apart that differ in texture or normal: one point to us.
         local = trimesh.Trimesh(
             np.asarray(loaded.vertices, dtype=np.float64) * self.scale, loaded.faces, process=False
@@ -75,7 +82,12 @@ class MeshFile:
         local.apply_transform(self.T_link)
         if self.scale.prod() < 0.0:
             local.invert()
-        read_triangles(local, f"{what}, '{self.path}'", _MAX_EXTENT)
+        extent = float(np.ptp(read_triangles(local, what, _MAX_EXTENT), axis=(0, 1)).max())
+        if not local.area > _NO_AREA * extent**2:
+            raise RobotError(
+                f"{what}: the mesh has no area, its triangles are lines or points; give a mesh "
+                "file with a surface, or spheres= for the link"
+            )
         return local
 
     def triangles(self) -> Float[np.ndarray, "f 3 3"]:
@@ -88,7 +100,8 @@ def _loaded(path: Path, what: str) -> Any:
     import trimesh
 
     try:
-        scene = trimesh.load_scene(path)
+        # Processing would cut out vertices that are not finite, and their faces, in silence.
+        scene = trimesh.load_scene(path, process=False)
         units = scene.units if path.suffix.lower() == ".dae" else None
         mesh = scene.to_mesh()
     except Exception as error:  # trimesh's readers raise whatever their format does
@@ -110,8 +123,9 @@ def find_mesh(
 
     ``package://NAME/REST`` is looked for as ``package_dirs`` says, in ROS_PACKAGE_PATH and in
     AMENT_PREFIX_PATH (``share/NAME``), beside each folder above the URDF, and last as
-    ``REST`` below each of these folders (a checkout need not have the package's name).
-    Other names are relative to the URDF's folder.
+    ``REST`` below each of these folders (a checkout need not have the package's name): that
+    may be another package's file, so it is logged, and not done for a package that
+    ``package_dirs`` has. Other names are relative to the URDF's folder.
 
     Args:
         filename: The element's attribute.
@@ -123,13 +137,24 @@ def find_mesh(
     """
     scheme, _, rest = filename.rpartition("://")
     folder = urdf.absolute().parent
+    guesses: list[Path] = []
     if scheme in ("package", "model"):
         places = _in_packages(rest, folder, package_dirs)
+        guesses = [] if _names(package_dirs, rest) else _nameless(rest, folder)
     elif scheme in ("", "file"):
         places = [folder / rest]  # an absolute path replaces the folder
     else:
         places = []
     found = next((place for place in places if place.is_file()), None)
+    if found is None:
+        found = next((place for place in guesses if place.is_file()), None)
+        places = places + guesses
+        if found is not None:
+            _logger.warning(
+                "no package of the name was found for '%s'; '%s' is taken, whose folder is called "
+                "otherwise: if that is another package's file, pass package_dirs=",
+                *(filename, found),
+            )
     return found, [str(place) for place in places] or [filename]
 
 
@@ -153,6 +178,20 @@ def _in_packages(reference: str, folder: Path, package_dirs: PackageDirs) -> lis
             places.append(root / rest)
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     places += [Path(prefix) / "share" / package / rest for prefix in prefixes if prefix]
-    above = [folder, *folder.parents]
-    places += [parent / package / rest for parent in above]
-    return places + [parent / rest for parent in above]
+    return places + [parent / package / rest for parent in [folder, *folder.parents]]
+
+
+def _nameless(reference: str, folder: Path) -> list[Path]:
+    rest = reference.partition("/")[2]
+    return [parent / rest for parent in [folder, *folder.parents]]
+
+
+def _names(package_dirs: PackageDirs, reference: str) -> bool:
+    """Whether the caller says where the package is."""
+    package = reference.partition("/")[0]
+    if package_dirs is None or isinstance(package_dirs, Mapping):
+        return package in (package_dirs or {})
+    given = [package_dirs] if isinstance(package_dirs, str | Path) else package_dirs
+    return any(
+        Path(root).absolute().name == package or (Path(root) / package).is_dir() for root in given
+    )

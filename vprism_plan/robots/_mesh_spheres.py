@@ -45,7 +45,8 @@ def read_triangles(
         if not path.is_file():
             raise RobotError(f"{what}: no mesh file at '{path}'; give an existing file")
         try:
-            mesh = trimesh.load_mesh(path)
+            # Processing would cut out vertices that are not finite, and their faces, in silence.
+            mesh = trimesh.load_mesh(path, process=False)
         except Exception as error:  # trimesh's readers raise whatever their format does
             raise RobotError(f"{what}: '{path}' cannot be read as a mesh: {error}") from error
         what = f"{what}, '{path}'"
