@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What went wrong once, in silence: each test is named after what broke."""
 
+import numpy as np
 import pytest
+import yaml
 from small_urdfs import LIMIT, LINK, TWO, chain, joint
 
 from vprism_plan.cli import main
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import Robot
+from vprism_plan.robots import Robot, SphereFit, read_spheres
 from vprism_plan.robots._mesh_files import find_mesh
+from vprism_plan.robots._sphere_files import _loader
 
 BIG = [{"center": [0, 0, 0], "radius": 0.06}]
 SMALL = [{"center": [0, 0, 0], "radius": 0.03}]
@@ -192,3 +195,69 @@ def test_another_packages_file_is_not_taken_in_silence(tmp_path, caplog):
     for dirs in ({"other": ros / "other"}, ros, [ros / "other"]):
         assert find_mesh(name, urdf, dirs)[0] is None
     assert not caplog.records
+
+
+@pytest.mark.parametrize("xyz", ["0.3", "0 0 0.3 0", "0 0", "", "0 0 inf", "0 0 x"])
+@pytest.mark.parametrize("where", ["joint", "link"])
+def test_an_origin_is_three_finite_numbers(write, where, xyz):
+    origin = f'<origin xyz="{xyz}"/>'
+    if where == "joint":
+        text = TWO.replace('<origin xyz="0 0 0.3"/>', origin)
+    else:
+        text = TWO.replace("<collision>", f"<collision>{origin}", 1)
+    with pytest.raises(RobotError, match=rf"{where} '.*' .*<origin> with xyz=.*; write finite"):
+        Robot.from_urdf(write(text))
+    with pytest.raises(RobotError, match="rpy="):
+        Robot.from_urdf(write(text.replace(origin, '<origin rpy="0.3"/>')))
+
+
+@pytest.mark.parametrize("center", [[0.1], 0.2, [[0, 0, 0]], [0, 0, 0, 0], None])
+def test_a_centre_is_three_numbers(center):
+    with pytest.raises(RobotError, match="expected"):
+        read_spheres({"a": [{"center": center, "radius": 0.1}]})
+
+
+def test_a_second_list_for_a_link_does_not_replace_the_first(write):
+    row = "- {center: [0, 0, 0], radius: 0.1}"
+    path = write(f"collision_spheres:\n  a:\n  {row}\n  b: []\n  a:\n  {row}\n", "s.yml")
+    with pytest.raises(RobotError, match=r"s\.yml' is not valid YAML.*'a' occurs twice(.|\n)*5"):
+        read_spheres(path)
+    merged = "x: &x {a: 1, b: 2}\ny: {<<: *x, a: 3}\n"
+    assert yaml.load(merged, Loader=_loader()) == yaml.safe_load(merged)
+
+
+@pytest.mark.parametrize(
+    ("factor", "turns"), [("1", True), ("-2", True), ("0", True), ("0.5", False), ("1.5", False)]
+)
+def test_a_continuous_follower_is_where_it_was_after_a_whole_turn(write, factor, turns):
+    follow = f'<mimic joint="j1" multiplier="{factor}"/>'
+    free = {"kind": "continuous", "limit": ""}
+    text = chain(joint("j1", "a", "b", **free), joint("j2", "b", "c", extra=follow, **free))
+    robot = Robot.from_urdf(write(text))
+    assert robot.continuous.tolist() == [turns]
+    np.testing.assert_array_equal([robot.lower[0], robot.upper[0]], [-np.pi, np.pi])
+
+
+def test_written_spheres_keep_the_buffer_of_the_file(write, tmp_path):
+    content = {"collision_spheres": dict.fromkeys("abc", BIG)}
+    content["collision_sphere_buffer"] = {"a": 0.01, "b": 0.02}
+    path = write(TWO)
+    robot = Robot.from_urdf(path, spheres={"kinematics": content})
+    robot.with_padding(0.5).write_spheres(tmp_path / "out.yml")
+    assert "without the padding" in (tmp_path / "out.yml").read_text()
+    again = Robot.from_urdf(path, spheres=tmp_path / "out.yml")
+    np.testing.assert_array_equal(again.sphere_radii, robot.sphere_radii)
+    np.testing.assert_array_equal(again.arrays.link_padding, robot.arrays.link_padding)
+    np.testing.assert_allclose(again.arrays.link_padding, [0.01, 0.02, 0.0])
+    with pytest.raises(RobotError, match=r"pads the links \['hnad'\]"):
+        read_spheres({"collision_spheres": {"a": BIG}, "padding": {"hnad": 0.1}})
+
+
+def test_a_fit_for_links_that_are_not_there_is_refused(write):
+    with pytest.raises(RobotError, match=r"max_spheres names the links \['hnad'\]"):
+        Robot.from_urdf(write(TWO), fit=SphereFit(max_spheres={"hnad": 1}))
+
+
+def test_fit_and_spheres_are_not_both_taken(write, capsys):
+    assert main(["robot", str(write(TWO)), "--fit", "--spheres", "s.yml"]) == 2
+    assert "--fit does not go with --spheres" in capsys.readouterr().err

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vprism_plan.cli._commands import RobotInfo
 from vprism_plan.cli._console import Console
+from vprism_plan.errors import ConfigError
 
 if TYPE_CHECKING:
     from vprism_plan.robots import Robot, RobotReport
@@ -18,6 +19,8 @@ def run_robot(command: RobotInfo, console: Console) -> int:
     """Read a robot, compare its spheres with its geometry; write what was asked for."""
     from vprism_plan.robots import Robot, SphereFit
 
+    if command.fit and command.spheres is not None:
+        raise ConfigError("--fit does not go with --spheres FILE; leave one of them out")
     began = time.perf_counter()
     spheres: Any = "fit" if command.fit else command.spheres
     with console.stage("robot"):

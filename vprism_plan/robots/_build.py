@@ -95,6 +95,7 @@ def robot_fields(request: Request) -> tuple[dict[str, Any], dict[str, float]]:
         "_sampled_pairs": {pair: _hangs_on(model, fixed_values, pair) for pair in sampled},
         "link_spheres": chosen.rows,
         "sphere_sources": chosen.sources,
+        "_file_padding": chosen.padding,
     }
     return fields, chosen.padding
 

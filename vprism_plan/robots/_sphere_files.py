@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,7 +46,7 @@ def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
     Understood are
 
     - ``collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}``, or the inner
-      mapping by itself, which ``write_spheres`` writes;
+      mapping by itself, which ``write_spheres`` writes; beside it, ``padding: {link: metres}``;
     - cuRobo's robot files, with ``robot_cfg: kinematics: collision_spheres`` as the name of
       a file beside it or inline, and its files of spheres alone (with a key ``robot``).
       A radius of 0 or below switches a sphere off; ``collision_sphere_buffer`` is padding;
@@ -74,7 +75,15 @@ def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
     if kinematics is not content:
         return _from_curobo(kinematics, source, folder)
     alone = isinstance(content, Mapping) and "robot" in content
-    return SphereTable(source, _table(content, source, off=alone), foreign=alone)
+    spheres_of = _table(content, source, off=alone)
+    padding: dict[str, float] = {}
+    if isinstance(content, Mapping) and "collision_spheres" in content and not alone:
+        own = content.get("padding")
+        unknown = sorted(set(own) - set(spheres_of)) if isinstance(own, Mapping) else []
+        if unknown:
+            raise RobotError(f"{source} pads the links {unknown}, to which it gives no spheres")
+        padding = _padding(own, spheres_of, source)
+    return SphereTable(source, spheres_of, padding, foreign=alone)
 
 
 def _yaml(path: Path) -> Any:
@@ -83,9 +92,31 @@ def _yaml(path: Path) -> Any:
     if not path.is_file():
         raise RobotError(f"no sphere file at '{path}'; give an existing YAML or XRDF file")
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_loader())
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise RobotError(f"'{path}' is not valid YAML: {error}") from error
+
+
+@functools.cache
+def _loader() -> Any:
+    """YAML's safe loader, which would keep only the last of several lists for one link."""
+    import yaml
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node = super().compose_mapping_node(anchor)
+            seen = set()
+            for key, _ in node.value:
+                name = str(key.value)
+                if name in seen:
+                    raise yaml.constructor.ConstructorError(
+                        problem=f"the key '{name}' occurs twice; join the two",
+                        problem_mark=key.start_mark,
+                    )
+                seen.add(name)
+            return node
+
+    return Loader
 
 
 def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
@@ -158,8 +189,8 @@ def _rows(link: str, entries: Any, source: str, off: bool) -> Float[np.ndarray, 
     rows = np.empty((len(entries), 4))
     for row, entry in zip(rows, entries, strict=True):
         try:
-            row[:3] = entry["center"]
-            row[3] = entry["radius"]
+            x, y, z = entry["center"]
+            row[:] = float(x), float(y), float(z), float(entry["radius"])
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise RobotError(
                 f"{source}: a sphere of '{link}' is {entry!r}; expected "
@@ -174,7 +205,10 @@ def _rows(link: str, entries: Any, source: str, off: bool) -> Float[np.ndarray, 
 
 
 def write_spheres(
-    path: str | Path, spheres: Mapping[str, Float[np.ndarray, "n 4"]], note: str = ""
+    path: str | Path,
+    spheres: Mapping[str, Float[np.ndarray, "n 4"]],
+    note: str = "",
+    padding: Mapping[str, float] | None = None,
 ) -> None:
     """Write spheres as YAML that :func:`read_spheres` reads back bit by bit.
 
@@ -182,6 +216,8 @@ def write_spheres(
         path: The file.
         spheres: Link -> (n, 4) rows (x, y, z, radius), link frame, metres.
         note: Lines for a comment at the top.
+        padding: Link -> metres that a robot's spheres grow by against the world, not
+            contained in their radii.
     """
     lines = [f"# {line}".rstrip() for line in note.splitlines()]
     lines.append("collision_spheres:")
@@ -190,6 +226,9 @@ def write_spheres(
         for row in rows:
             x, y, z, radius = (_number(float(value)) for value in row)
             lines.append(f"    - {{center: [{x}, {y}, {z}], radius: {radius}}}")
+    if padding:
+        lines.append("padding:")
+        lines += [f"  {_key(link)}: {_number(float(value))}" for link, value in padding.items()]
     write_text(path, "\n".join(lines) + "\n")
 
 

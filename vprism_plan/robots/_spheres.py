@@ -68,6 +68,7 @@ def link_spheres(
         RobotError: A sphere is malformed, names an unknown link, or a link with
             collision geometry would be left without any.
     """
+    _check_names(model, fit)
     if spheres is None:
         beside = urdf_path.with_name(f"{urdf_path.stem}_spheres.yml")
         spheres = beside if beside.is_file() else FIT
@@ -114,6 +115,16 @@ def link_spheres(
         {name: sources[name] for name in order},
         table.padding,
     )
+
+
+def _check_names(model: RobotModel, fit: SphereFit) -> None:
+    table = fit.max_spheres
+    unknown = sorted(set(table) - set(model.links)) if isinstance(table, Mapping) else []
+    if unknown:
+        raise RobotError(
+            f"max_spheres names the links {unknown}, which the robot does not have; "
+            f"links: {list(model.links)}"
+        )
 
 
 def _has_geometry(model: RobotModel, name: str) -> bool:

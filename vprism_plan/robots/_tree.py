@@ -85,7 +85,8 @@ def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
     """The joints that others mimic, with limits that keep these in their own.
 
     A continuous joint becomes a revolute one if a limited joint follows it: where it may
-    turn without end, what follows it may not.
+    turn without end, what follows it may not. So it does, within [-pi, pi], if a continuous
+    joint follows it by a factor that is no integer: that is elsewhere after a whole turn.
     """
     result: dict[str, Joint] = {}
     for joint in model.joints:
@@ -114,4 +115,11 @@ def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
             continue
         kind = "revolute" if turns else driver.kind
         result[name] = replace(driver, kind=kind, lower=lower, upper=upper)
+    for joint in model.joints:
+        if joint.mimic is None or joint.kind != "continuous":
+            continue
+        name, factor, _ = model.resolve_mimic(joint.name)
+        driver = result.get(name, model.joint_map[name])
+        if driver.kind == "continuous" and abs(factor - round(factor)) > 1e-9:
+            result[name] = replace(driver, kind="revolute")
     return result

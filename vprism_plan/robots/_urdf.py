@@ -78,14 +78,33 @@ def _clean_xml(path: Path) -> bytes:
         _require(link, "name", path)
         copy = ET.SubElement(kept, "link", {"name": link.attrib["name"]})
         copy.extend(link.findall("collision"))
+        for origin in copy.iterfind("collision/origin"):
+            _check_origin(origin, f"link '{link.get('name')}'", path)
     for joint in root.findall("joint"):
         _require(joint, "name", path)
         for part in ("parent", "child"):
             element = joint.find(part)
             if element is None or not element.get("link"):
                 raise RobotError(f"joint '{joint.get('name')}' in '{path}' names no {part} link")
+        for origin in joint.iterfind("origin"):
+            _check_origin(origin, f"joint '{joint.get('name')}'", path)
         kept.append(joint)
     return ET.tostring(kept)
+
+
+def _check_origin(origin: ET.Element, whose: str, path: Path) -> None:
+    """Refuse what yourdfpy takes: one number for all three, and more than three."""
+    for key in ("xyz", "rpy"):
+        text = origin.get(key, "0 0 0")
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = []
+        if len(values) != 3 or not all(map(math.isfinite, values)):
+            raise RobotError(
+                f"{whose} in '{path}' has an <origin> with {key}={text!r}; write finite numbers, "
+                "three of them"
+            )
 
 
 def _require(element: ET.Element, attribute: str, path: Path) -> None:
@@ -97,10 +116,6 @@ def _link(element: Any, path: Path, package_dirs: PackageDirs) -> Link:
     primitives, meshes = [], []
     for collision in element.collisions:
         T = np.eye(4) if collision.origin is None else np.array(collision.origin, dtype=np.float64)
-        if not np.isfinite(T).all():
-            raise RobotError(
-                f"link '{element.name}' in '{path}' has a non-finite <origin>; write finite numbers"
-            )
         if collision.geometry.mesh is not None:
             meshes.append(_mesh(element.name, collision.geometry.mesh, T, path, package_dirs))
         else:
@@ -149,10 +164,6 @@ def _joint(element: Any, path: Path) -> Joint:
             "fixed. Replace it by a fixed joint and place the robot with base_pose"
         )
     T = np.eye(4) if element.origin is None else np.array(element.origin, dtype=np.float64)
-    if not np.isfinite(T).all():
-        raise RobotError(
-            f"joint '{name}' in '{path}' has a non-finite <origin>; write finite numbers"
-        )
     mimic = None
     if element.mimic is not None and kind != "fixed":
         mimic = (element.mimic.joint, element.mimic.multiplier, element.mimic.offset)

@@ -102,6 +102,8 @@ class Robot:
     meshes_as_read: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     # Pairs disabled by random configurations -> whether the values of locked joints enter.
     _sampled_pairs: dict[frozenset[str], bool] = field(default_factory=dict, repr=False)
+    # Link -> metres that the file of its spheres wants it to grow by; in `arrays` already.
+    _file_padding: dict[str, float] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -446,10 +448,15 @@ class Robot:
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is
         read from then on, which spares the fit. Reading gives the same numbers, bit by bit.
+
+        The buffer of a file of cuRobo or XRDF is written as ``padding``, apart from the radii;
+        that of :meth:`with_padding` is not written.
         """
         bare = {name: np.empty((0, 4)) for name in (*self.geometry, *self.links_with_meshes)}
         note = f"Collision spheres of {self.name}, metres, in link frames."
-        write_spheres(path, bare | self.link_spheres, note)
+        if self._file_padding:
+            note += "\nRadii are without the padding at the end, which is added when this is read."
+        write_spheres(path, bare | self.link_spheres, note, self._file_padding)
 
     def write_srdf(self, path: str | Path) -> None:
         """Write an SRDF: the configuration's joints as group "arm", other groups, named
