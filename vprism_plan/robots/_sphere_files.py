@@ -102,7 +102,7 @@ def _loader() -> Any:
     """YAML's safe loader, which would keep only the last of several lists for one link."""
     import yaml
 
-    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+    class Loader(yaml.SafeLoader):
         def compose_mapping_node(self, anchor: Any) -> Any:
             node = super().compose_mapping_node(anchor)
             seen = set()
