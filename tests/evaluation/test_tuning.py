@@ -8,7 +8,10 @@ from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.experiments.tuning import compare
 from vprism_plan.mapping import MapConfig
 
-COARSE = replace(MapConfig(), hinge_spacing=0.06, iterations=2, object_resolution=0.02)
+COARSE = replace(
+    MapConfig(), gamma=1000.0, hinge_spacing=0.06, hinge_reach=None, iterations=2,
+    object_resolution=0.02, front_resolution=0.01, prior_logit_variance=10.0,
+)  # fmt: skip
 
 
 def test_the_first_setting_is_the_reference_and_answers_are_kept(tmp_path):
