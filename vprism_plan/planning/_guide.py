@@ -82,6 +82,7 @@ class GuidedGoal(ob.GoalSampleableRegion):
         else:
             q = self._around(self._path)
         write_state(self._space, q, state)
+        self._space.enforceBounds(state)  # OMPL takes a goal's samples as they are
 
     def _around(self, path: Float[np.ndarray, "t dof"]) -> Float[np.ndarray, " dof"]:
         """Return a state near a random place of a path."""

@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from vprism_plan.planning._clock import Now
 from vprism_plan.planning._protocol import CheckerLike
@@ -19,16 +19,20 @@ from vprism_plan.planning.result import PlanReport, PlanResult
 
 _log = logging.getLogger(__name__)
 
+_ROUNDING = 1e-9  # radians or metres beyond a joint limit that count as on it
+
 
 class MotionCheck:
     """Counts and answers `checker.check_motion` for edges that may become part of a path.
 
     An edge that turns a continuous joint by half a turn or more is refused: whoever
-    follows the path could take it for the shorter way round.
+    follows the path could take it for the shorter way round. So is one that leaves the
+    joint limits, which not every checker knows.
     """
 
     def __init__(self, checker: CheckerLike) -> None:
         self._check = checker.check_motion
+        self._robot = checker.robot
         self._turns = np.asarray(checker.robot.continuous, dtype=bool)
         self.count = 0
 
@@ -36,7 +40,16 @@ class MotionCheck:
         self.count += 1
         if np.any(np.abs(qb - qa)[self._turns] >= np.pi):
             return False
+        if outside_limits(self._robot, np.stack([qa, qb])).any():
+            return False
         return check_straight(self._check, qa, qb, self._turns)
+
+
+def outside_limits(robot: Any, path: Float[np.ndarray, "t dof"]) -> Bool[np.ndarray, " t"]:
+    """Return which rows have a limited joint outside its limits by more than rounding."""
+    low = path < np.asarray(robot.lower) - _ROUNDING
+    high = path > np.asarray(robot.upper) + _ROUNDING
+    return np.asarray(np.any((low | high) & ~np.asarray(robot.continuous, dtype=bool), axis=1))
 
 
 def resample(
@@ -91,12 +104,14 @@ def verified(
     )
     if failed is not None:
         _log.warning("edge %d of the final path failed its verification", failed)
+        outside = outside_limits(checker.robot, path[failed : failed + 2]).any()
+        reason = "it leaves the joint limits" if outside else one_line(verdicts[-1])
         return PlanResult(
             path=None,
             status="verification_failed",
             report=replace(report, goal_index=None),
             message=f"edge {failed} of {len(path) - 1} of the final path was refused when checked "
-            f"again: {one_line(verdicts[-1])}",
+            f"again: {reason}",
             approximate_path=path,
             explanation=verdicts[-1],
         )
@@ -125,13 +140,14 @@ def _first_bad_edge(
 ) -> int | None:
     """Append a report per checked motion; return the first refused edge, None if all pass."""
     turns = np.asarray(checker.robot.continuous, dtype=bool)
+    outside = outside_limits(checker.robot, path)
 
     def check(qa: np.ndarray, qb: np.ndarray) -> bool:
         verdicts.append(checker.check_motion_report(qa, qb))
         return bool(verdicts[-1].valid and checker.check_motion(qa, qb))
 
     for edge, (a, b) in enumerate(pairwise(path)):
-        if not check_straight(check, a, b, turns):
+        if not check_straight(check, a, b, turns) or outside[edge : edge + 2].any():
             return edge
     return None
 

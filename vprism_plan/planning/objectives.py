@@ -53,6 +53,7 @@ class RiskObjective:
                 f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}, or a function"
             )
         _require_weight(self.length_weight)
+        _require_spacing(self.spacing)
 
     @property
     def name(self) -> str:
@@ -70,10 +71,16 @@ def _require_weight(value: Any) -> None:
         raise PlanningError(f"length_weight is {value!r}; it must be finite and at least 0")
 
 
+def _require_spacing(value: Any) -> None:
+    if not (math.isfinite(value) and value > 0.0):
+        raise PlanningError(f"spacing is {value!r}; it must be finite and more than 0")
+
+
 class _FunctionRisk:
     """`MotionRisk` for rates that a user's function gives; "metres" are those of joint space."""
 
     def __init__(self, rates: Rates, spacing: float) -> None:
+        _require_spacing(spacing)
         self.kind = "function"
         self._rates = rates
         self._spacing = spacing
@@ -82,7 +89,7 @@ class _FunctionRisk:
         """Return rates at equal steps of a motion, and its length."""
         way = float(np.linalg.norm(qb - qa))
         t = np.linspace(0.0, 1.0, max(1, math.ceil(way / self._spacing)) + 1)[:, None]
-        return np.asarray(self._rates(qa + t * (qb - qa)), dtype=np.float64), way
+        return self._checked(qa + t * (qb - qa)), way
 
     def motion(self, qa: np.ndarray, qb: np.ndarray) -> float:
         values, way = self.samples(qa, qb)
@@ -92,7 +99,23 @@ class _FunctionRisk:
         return float(np.max(self.samples(qa, qb)[0]))
 
     def state(self, q: np.ndarray) -> float:
-        return float(np.asarray(self._rates(q[None]))[0])
+        return float(self._checked(q[None])[0])
+
+    def _checked(self, Q: np.ndarray) -> np.ndarray:
+        """Return the rates at rows of Q; planners crash the process over negative costs."""
+        rates = np.asarray(self._rates(Q), dtype=np.float64)
+        if rates.shape != (len(Q),):
+            raise PlanningError(
+                f"the function of the objective returned shape {rates.shape} for "
+                f"configurations {Q.shape}; it must return ({len(Q)},), one rate each"
+            )
+        bad = np.flatnonzero(~(np.isfinite(rates) & (rates >= 0.0)))
+        if len(bad):
+            raise PlanningError(
+                f"the function of the objective returned {rates[bad[0]]} at "
+                f"{Q[bad[0]].tolist()}; rates must be finite and at least 0"
+            )
+        return rates
 
 
 class PathCost:
