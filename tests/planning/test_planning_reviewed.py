@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a review of the planning code broke, kept from breaking again."""
 
+from itertools import pairwise
+
 import disk_world
 import numpy as np
 import pytest
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning import RiskObjective, plan
+from vprism_plan.planning import RiskObjective, plan, planner
+from vprism_plan.planning._search import SearchOutcome, SearchRequest, search
 from vprism_plan.planning._verify import MotionCheck, verified
 from vprism_plan.planning.result import PlanReport
 
@@ -71,3 +74,74 @@ def test_rates_that_crash_a_planner_are_refused(rates, named):
 def test_spacings_that_sample_nothing_are_refused(spacing):
     with pytest.raises(PlanningError, match="spacing"):
         RiskObjective(kind=ones, spacing=spacing)
+
+
+def test_a_path_that_costs_nothing_is_noted_once():
+    """BITstar returned at once from every further call, and each made an entry."""
+    wall = disk_world.wall_with_gap()
+    result = plan(
+        wall, [-0.7, -0.5], [0.7, -0.5], "BITstar", 0.5, simplify=False,
+        objective=RiskObjective(kind=lambda Q: np.zeros(len(Q)), length_weight=0.0),
+    )  # fmt: skip
+    assert result.solved
+    assert len(result.report.history) <= 2
+
+
+class Slalom(disk_world.DiskChecker):
+    """Three thin walls of small balls, with gaps up, down and up."""
+
+    def __init__(self):
+        ys = np.arange(-1.0, 1.0, 0.01)
+        rows = [
+            (x, y) for x, gap in ((-0.4, 0.6), (0.0, -0.6), (0.4, 0.6)) for y in ys
+            if abs(y - gap) > 0.05
+        ]  # fmt: skip
+        super().__init__(rows, np.full(len(rows), 0.006), disk_world.robot())
+
+
+def test_a_lead_past_thin_walls_is_not_lost():
+    slalom = Slalom()
+    ways = [(-0.8, -0.8), (-0.5, 0.6), (-0.3, 0.6), (-0.1, -0.6), (0.1, -0.6), (0.3, 0.6)]
+    lead = np.array([*ways, (0.5, 0.6), (0.8, -0.8)])
+    assert all(slalom.check_motion(a, b) for a, b in pairwise(lead))
+    cost = RiskObjective(kind=ones).cost(slalom)
+    for seed in range(2):
+        request = SearchRequest("RRTstar", 4.0, seed, "first", None, (0.01, 1000))
+        outcome = search(slalom, lead[0], lead[-1:], request, cost, lead)
+        assert outcome.status == "exact"
+
+
+@pytest.mark.parametrize(
+    "options", [{"planner": "FMT"}, {"planner": "RRTstar", "warm_start": False}]
+)
+def test_a_known_direct_motion_is_not_thrown_away(options, monkeypatch):
+    """And the goal that it leads to is the one that was asked about."""
+
+    def nothing(*unused):
+        return SearchOutcome("timeout", None, None, 0.1, 0, 0)
+
+    monkeypatch.setattr(planner, "search", nothing)
+    blocked_first = disk_world.DiskChecker([(0.0, 0.5)], [0.2], disk_world.robot())
+    result = plan(
+        blocked_first, [-0.5, 0.5], [[0.5, 0.5], [0.5, 0.0]], time_limit=0.3, simplify_time=0.1,
+        objective=RiskObjective(kind=ones), **options,
+    )  # fmt: skip
+    assert result.solved
+    assert result.report.goal_index == 1
+
+
+def test_the_goal_of_a_lead_round_a_continuous_joint_is_named(monkeypatch):
+    """The lead ends at 3.3, a whole turn from its goal, and nearer to the other one."""
+
+    def nothing(*unused):
+        return SearchOutcome("timeout", None, None, 0.1, 0, 0)
+
+    monkeypatch.setattr(planner, "search", nothing)
+    turning = disk_world.DiskChecker([(2.5, 0.0)], [0.05], disk_world.robot(2, (0,)))
+    goals = [[2.0, 0.0], [3.3 - 2.0 * np.pi, 0.3]]
+    result = plan(
+        turning, [3.0, 0.0], goals, "RRTstar", 0.3, simplify_time=0.1,
+        objective=RiskObjective(kind=ones),
+    )  # fmt: skip
+    assert result.solved
+    assert result.report.goal_index == 1

@@ -18,14 +18,16 @@ from vprism_plan.planning._spaces import StateReader, write_state
 
 _BIAS = 0.5  # share of the samples that come from here
 _FINEST, _WIDEST = 0.01, 0.5  # spread of samples around a path, as a share of the step
+_LEAD_PART = 0.1  # of the planner's step, between states of the lead: see `lead`
 _MANY = 2**31 - 1
 
 
 class GuidedGoal(ob.GoalSampleableRegion):
     """Several goal configurations, and samples that lead there.
 
-    The tree reaches a goal by growing exactly to it; `sampleGoal` hands goals out until that
-    has happened, then never again: the tree would collect copies of it.
+    The tree reaches a goal by growing exactly to it; the last state of the lead is one.
+    `sampleGoal` hands the lead out once, then only states around the best path: of goals the
+    tree would collect copies.
 
     Args:
         si: the space information.
@@ -47,12 +49,16 @@ class GuidedGoal(ob.GoalSampleableRegion):
         self._path: np.ndarray | None = None
 
     def lead(self, path: Float[np.ndarray, "t dof"]) -> None:
-        """Hand out the states of a path, start left out, then states around it."""
+        """Hand out the states of a path, start left out, then states around it.
+
+        The tree grows to each from its nearest node, which near a thin obstacle may be one on
+        the other side: states much closer together than a step leave the last one nearest.
+        """
         pieces = [path[:1]]
         for a, b in pairwise(path):
             # The distance of a compound space is at most sqrt(dof) times the Euclidean one.
             width = float(np.abs(b - a).sum() if self._wraps.any() else np.linalg.norm(b - a))
-            n = max(1, int(np.ceil(width / (0.99 * self._step))))
+            n = max(1, int(np.ceil(width / (_LEAD_PART * self._step))))
             pieces.append(a + (b - a) * (np.arange(1, n + 1)[:, None] / n))
         self._queue = list(np.concatenate(pieces)[:0:-1])
         self._path = path
@@ -77,9 +83,8 @@ class GuidedGoal(ob.GoalSampleableRegion):
         """Write the next state to grow towards."""
         if self._queue:
             q = self._queue.pop()
-        elif self._path is None:
-            q = self._goals[self._rng.integers(len(self._goals))]
         else:
+            assert self._path is not None, "lead() comes first"
             q = self._around(self._path)
         write_state(self._space, q, state)
         self._space.enforceBounds(state)  # OMPL takes a goal's samples as they are

@@ -211,6 +211,7 @@ def _solve(
         settled = CostConvergence(planner, tolerance, patience)
     improved = Improvements(planner, _NOTICEABLE if kind.resumes else 2.0)
     history: list[Improvement] = []
+    idle = 0
     try:
         while True:
             # A condition that has held once holds for ever: each round has its own.
@@ -218,12 +219,17 @@ def _solve(
             status = planner.solve(_any_of(timed, settled, improved))
             if not (kind.resumes and problem.hasExactSolution()):
                 break
-            path = _waypoints(reader, problem.getSolutionPath())
-            history.append(Improvement(now() - began, planner.bestCost().value(), path))
-            if guided is not None:
-                guided.follow(path)
+            value = planner.bestCost().value()
+            better = not history or value < history[-1].cost
+            idle = 0 if better else idle + 1
+            if better:
+                path = _waypoints(reader, problem.getSolutionPath())
+                history.append(Improvement(now() - began, value, path))
+                if guided is not None:
+                    guided.follow(path)
             over = settled is not None and settled.done
-            if over or now() >= end or request.stop == "first":
+            # A planner that returns again and again has nothing left to improve: a cost of 0.
+            if over or idle > 1 or now() >= end or request.stop == "first":
                 break
         return status, tuple(history)
     finally:

@@ -148,9 +148,9 @@ def plan(
             found = replace(report, direct=True, goal_index=direct[0])
             return verified(judge, path, clearance_step, found, now)
         other = replace(request, time_limit=limit, seed=_other_seed(request.seed, 64 * number))
-        lead = None if direct is None else direct[1]
+        index, lead = (None, None) if direct is None else direct
         warm = warm_start and cost is not None and stop != "first"
-        begin = _Begin(warm and planner_kind(planner).goal_bias, lead)
+        begin = _Begin(warm and planner_kind(planner).goal_bias, lead, index)
         return _searched(judge, q_start, goals, other, finish, report, begin)
 
     result = within_risk(checker, attempt, request.time_limit, now)
@@ -194,10 +194,12 @@ class _Begin:
     Attributes:
         warm: whether the planner is to be led along a path that is known.
         lead: such a path, or None: then it has to be searched for.
+        goal_index: the goal that it leads to.
     """
 
     warm: bool
     lead: np.ndarray | None
+    goal_index: int | None
 
 
 @dataclass(frozen=True)
@@ -297,7 +299,11 @@ def _led(
 ) -> SearchOutcome:
     """Search, led along a known path if that is wanted: given, or RRTConnect's."""
     if not begin.warm:
-        return search(checker, start, goals, request, finish.cost)
+        found = search(checker, start, goals, request, finish.cost)
+        if found.status == "exact" or begin.lead is None:
+            return found
+        # The planner failed; that a straight motion is valid was known before.
+        return replace(found, status="exact", path=begin.lead, goal_index=begin.goal_index)
     lead, spent = begin.lead, 0.0
     quick: SearchOutcome | None = None
     if lead is None:
@@ -314,7 +320,8 @@ def _led(
     if left <= 0.0 and quick is not None:
         return quick
     found = search(checker, start, goals, replace(request, time_limit=left), finish.cost, lead)
-    return _better(found, lead, finish, spent, quick, goals)
+    index = begin.goal_index if quick is None else quick.goal_index
+    return _better(found, lead, finish, spent, quick, index)
 
 
 def _better(
@@ -323,7 +330,7 @@ def _better(
     finish: _Finish,
     spent: float,
     quick: SearchOutcome | None,
-    goals: Float[np.ndarray, "g dof"],
+    index: int | None,
 ) -> SearchOutcome:
     """Return the cheaper of what was found and what led there, with the effort of both."""
     assert finish.cost is not None
@@ -344,7 +351,6 @@ def _better(
     )
     if cheaper:
         return whole
-    index = quick.goal_index if quick else int(np.argmin(np.abs(goals - lead[-1]).max(axis=1)))
     return replace(whole, status="exact", path=lead, goal_index=index)
 
 
