@@ -147,8 +147,15 @@ class Candidates:
         self.iterations += self.minimum.iterations.numpy()
         with torch.no_grad():
             q = self.objective.trajectories(self.minimum.x, torch.arange(len(z))).numpy()
-        q[:, 1:-1] = np.clip(q[:, 1:-1], self.lower, self.upper)
-        self.ended = q
+        inside = q.copy()
+        inside[:, 1:-1] = np.clip(q[:, 1:-1], self.lower, self.upper)
+        clipped = np.flatnonzero((inside != q).any(axis=(1, 2)))
+        if len(clipped):  # what is handed out costs something else than what was minimised
+            rows = torch.from_numpy(clipped)
+            value = self.minimum.value.clone()
+            value[rows] = self.objective.values(torch.from_numpy(inside[clipped]), rows)
+            self.minimum = replace(self.minimum, value=value)
+        self.ended = inside
         self.rounds += 1
         self.optimization_time += time.perf_counter() - began
         _log.debug("round %d: costs %s", self.rounds, self.minimum.value.tolist())
@@ -163,7 +170,7 @@ class Candidates:
         for s in order:
             result, edge = self._judged(judge, self.ended[s])
             if result.solved:
-                self.refused[s] = ""
+                self.refused[s], self.edges[s] = "", -1
                 self._asked.append((_path_of(result), int(s)))
                 first = result
                 break

@@ -32,7 +32,8 @@ def default_cost(checker: Any, kept: float | None = None) -> TrajectoryCost:
     Squared velocity (which makes paths short and waypoints even) and a little acceleration,
     plus clearance, self-collision and joint limits, each with a margin beyond what the
     checker refuses, so that a converged trajectory passes. If the checker bounds risk, the
-    objects of the map enter as `RiskCost` instead, in the draws that edges are checked with.
+    objects of the map enter as `RiskCost`, in the draws that edges are checked with: instead,
+    or beside their level set where the bound is below the world's `level`.
 
     Args:
         checker: a `CollisionChecker`; its margins, allowed contacts and bound on risk count.

@@ -111,7 +111,7 @@ def lbfgs(evaluate: Evaluate, x: torch.Tensor, limits: Limits, memory: int = 10)
 
     Args:
         evaluate: see `Evaluate`; may return values that are not finite, which only
-            shortens the step.
+            shortens the step. A row whose first gradient is not finite stalls there.
         x: (S, n) where to begin.
         limits: when to end.
         memory: pairs of steps and gradient changes that are kept.
@@ -120,6 +120,9 @@ def lbfgs(evaluate: Evaluate, x: torch.Tensor, limits: Limits, memory: int = 10)
     count = len(x)
     value, slope = evaluate(x, torch.arange(count))
     progress = _Progress(count, _largest(slope), limits)
+    # There is no direction from there, and a row of NaN must not reach the cost.
+    lost = ~torch.isfinite(slope).all(dim=1)
+    progress.stop(torch.nonzero(lost.cpu())[:, 0], STALLED)
     state = _Lines(x, value, slope, memory)
     while len(rows := progress.active):
         if limits.over:

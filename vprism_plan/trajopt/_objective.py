@@ -88,6 +88,11 @@ class Objective:
         self._note(rows, total, terms)
         return total, gradient
 
+    def values(self, q: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        """Return costs (k,) of waypoints (k, T, dof), seeds (k,) with their emphasis."""
+        with torch.no_grad():
+            return torch.stack(list(self._named(q, rows).values())).sum(dim=0)
+
     def _named(self, q: torch.Tensor, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         terms = getattr(self.cost, "terms", None)
         named = dict(terms(q)) if callable(terms) else {"cost": self.cost(q)}

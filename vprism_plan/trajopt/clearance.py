@@ -32,8 +32,8 @@ class ClearanceCost(TrajectoryCost):
     Covers what a checker checks: objects, background, occluded and unobserved space by
     policy, known geometry, support surface and half-spaces. Links that no joint moves are
     left out. With a `CollisionChecker`, its margin counts as part of each sphere, and links
-    are compared with the fields that its allowed contacts (and `max_risk`, which leaves the
-    posterior's objects to `RiskCost`) give them.
+    are compared with the fields that its allowed contacts and `max_risk` give them: with a bound
+    on risk from the world's `level` on, the posterior's objects are left to `RiskCost`.
 
     The gap to the baked obstacles comes from a quadratic B-spline of the signed distance
     (`SplineField`), less a radius so much larger that a positive gap proves the sphere free

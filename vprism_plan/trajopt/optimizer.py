@@ -41,7 +41,7 @@ def optimize(
     time_limit: float | None = None,
     guard: Any = None,
     repairs: int = 4,
-    keep_clearance: bool | float = False,
+    keep_clearance: bool | np.bool_ | float = False,
     clearance_step: float = 0.05,
 ) -> OptimizeResult:
     """Optimise trajectories from `start` to `goal`, and return the best verified one.
@@ -82,7 +82,8 @@ def optimize(
         repairs: rounds after the first, at most.
         keep_clearance: True: the path's clearance, edges included, must not be below that
             of the initial path (the largest of several); a number: not below so many
-            metres. It becomes the margin of the default cost.
+            metres. Kept to 0.5 mm, what it is computed to. It becomes the margin of the
+            default cost.
         clearance_step: distance between the samples of the reported clearance.
 
     Returns:
@@ -176,12 +177,13 @@ def _paths(initial: Any) -> list[Any]:
 
 
 def _kept(
-    checker: CheckerLike, keep: bool | float, paths: list[np.ndarray], step: float
+    checker: CheckerLike, keep: bool | np.bool_ | float, paths: list[np.ndarray], step: float
 ) -> float | None:
     """Return the clearance to be kept, metres."""
-    if keep is False:
-        return None
-    if keep is not True:
+    if isinstance(keep, bool | np.bool_):
+        if not keep:
+            return None
+    else:
         if not math.isfinite(keep):
             raise PlanningError(
                 f"keep_clearance is {keep!r}; it must be True, False or a number of metres"
