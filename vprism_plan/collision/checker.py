@@ -50,8 +50,9 @@ class CollisionChecker(Queries):
     distances are lower bounds, so an error can only refuse. Links that no joint moves
     are not checked against the world: they stand on it.
 
-    `config.allowed_contacts` lets links touch chosen objects; `config.max_risk` replaces the
-    level set by a bound on the probability of collision (see `CheckerConfig`).
+    `config.allowed_contacts` lets links touch chosen objects; `config.max_risk` bounds the
+    probability of collision (see `CheckerConfig`): in place of the level set, or beside it
+    where the bound is below the world's `level`.
 
     Construction compiles the kernels if they are not cached on disk (some twenty seconds,
     once per machine). Safe to share between threads; the kernels release the GIL.
@@ -86,6 +87,7 @@ class CollisionChecker(Queries):
         self._lock = threading.Lock()
         self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
+        self._levels: tuple[int, ...] = ()  # of `tightened`, in turn
         if self.config.max_risk is not None:
             self._bounded = self._risk()
             self._fields, self._world = self._bounded.fields, self._bounded.packed
@@ -242,6 +244,7 @@ class CollisionChecker(Queries):
             return None
         stricter = copy.copy(self)
         stricter._bounded = bounded
+        stricter._levels = (*self._levels, level)
         return stricter
 
     def with_extra_margin(self, extra: float) -> "CollisionChecker":
@@ -249,7 +252,12 @@ class CollisionChecker(Queries):
         if not extra >= 0.0:
             raise ConfigError(f"extra is {extra!r} m; a margin can only be widened")
         config = replace(self.config, margin=self.config.margin + extra)
-        return CollisionChecker(self.world, self.robot, config)
+        wider = CollisionChecker(self.world, self.robot, config)
+        for level in self._levels:
+            tightened = wider.tightened(level)
+            assert tightened is not None  # the same bound and the same draws as here
+            wider = tightened
+        return wider
 
     def explain(self, q: Numbers) -> StateReport:
         """Return the verdict on a configuration with every reason that refuses it.

@@ -198,8 +198,8 @@ def _of_mesh(
         kind = "unexplained"  # a joint limit: both know the same
     elif contact.kind == "object" and _field_allows(checker, contact):
         kind = "contact rules"
-    elif contact.kind == "object" and checker.config.max_risk is not None:
-        kind = "posterior risk"  # draws judge the objects there, not the level set
+    elif contact.kind == "object" and _draws_judge(checker):
+        kind = "posterior risk"
     elif contact.depth <= _TOLERANCE:
         kind = "rounding"
     elif contact.sphere < 0 and not _in_spheres(meshes, q, links, np.array(contact.position)):
@@ -207,6 +207,12 @@ def _of_mesh(
     elif contact.kind == "object" and not _in_level_set(checker, contact):
         kind = "coarse mesh"
     return Cause(kind, contact.link, contact.body, contact.depth)
+
+
+def _draws_judge(checker: Any) -> bool:
+    """Whether draws judge the objects in place of the level set: below its level, both do."""
+    bound = checker.config.max_risk
+    return bound is not None and bound >= checker.world.config.level
 
 
 def _in_level_set(checker: Any, contact: Contact) -> bool:
