@@ -44,7 +44,7 @@ _SPOKEN: dict[str, str] = {
     "edge tolerance": "the field refuses it, too, and accepted the edge within its tolerance",
     "missed by the field": "the map says occupied and the field says free",
     "contact rules": "the two permit different contacts",
-    "posterior risk": "posterior worlds judge the objects, not the level set",
+    "posterior risk": "posterior worlds judge the objects",
     "unexplained": "no known cause",
 }
 

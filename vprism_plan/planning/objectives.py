@@ -234,6 +234,8 @@ class VPrismRiskObjective(_RiskBase):
 
     Raises:
         PlanningError: a value out of range, or a checker without a posterior.
+
+    Not for PRM and PRMstar: their second thread deadlocks with any objective in Python.
     """
 
     def __init__(

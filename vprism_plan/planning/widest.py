@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._clock import clock_named
 from vprism_plan.planning._protocol import CheckerLike
+from vprism_plan.planning.goals import ReachRegion
 from vprism_plan.planning.planner import plan
 from vprism_plan.planning.result import PlanResult
 
@@ -28,7 +29,7 @@ class MarginChecker(CheckerLike, Protocol):
 def plan_widest(
     checker: CheckerLike,
     start: ArrayLike | Sequence[float],
-    goal: ArrayLike | Sequence[float],
+    goal: ArrayLike | Sequence[float] | ReachRegion,
     extra: Sequence[float] = EXTRA,
     time_limit: float | int = 5.0,
     *,

@@ -272,6 +272,8 @@ def _answer(
     message = result.message
     if winner is not None:
         message = f"from seed {winner} ({seeds[winner].name}) of {len(seeds)}: {message}"
+    elif cheapest is not None and result.status == "too_risky":
+        message = f"least risky is seed {cheapest} ({seeds[cheapest].name}): {message}"
     elif cheapest is not None:
         message = (
             f"none of {len(seeds)} seeds passed; of least cost is {seeds[cheapest].name}: {message}"
