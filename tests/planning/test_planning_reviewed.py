@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What a review of the planning code broke, kept from breaking again."""
 
-from itertools import pairwise
-
 import disk_world
 import numpy as np
 import pytest
+from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning import RiskObjective, plan, planner
-from vprism_plan.planning._search import SearchOutcome, SearchRequest, search
+from vprism_plan.planning import RiskObjective, plan, planner, state_space
+from vprism_plan.planning._guide import GuidedGoal
+from vprism_plan.planning._search import SearchOutcome
 from vprism_plan.planning._verify import MotionCheck, verified
 from vprism_plan.planning.result import PlanReport
 
@@ -87,28 +87,16 @@ def test_a_path_that_costs_nothing_is_noted_once():
     assert len(result.report.history) <= 2
 
 
-class Slalom(disk_world.DiskChecker):
-    """Three thin walls of small balls, with gaps up, down and up."""
-
-    def __init__(self):
-        ys = np.arange(-1.0, 1.0, 0.01)
-        rows = [
-            (x, y) for x, gap in ((-0.4, 0.6), (0.0, -0.6), (0.4, 0.6)) for y in ys
-            if abs(y - gap) > 0.05
-        ]  # fmt: skip
-        super().__init__(rows, np.full(len(rows), 0.006), disk_world.robot())
-
-
-def test_a_lead_past_thin_walls_is_not_lost():
-    slalom = Slalom()
-    ways = [(-0.8, -0.8), (-0.5, 0.6), (-0.3, 0.6), (-0.1, -0.6), (0.1, -0.6), (0.3, 0.6)]
-    lead = np.array([*ways, (0.5, 0.6), (0.8, -0.8)])
-    assert all(slalom.check_motion(a, b) for a, b in pairwise(lead))
-    cost = RiskObjective(kind=ones).cost(slalom)
-    for seed in range(2):
-        request = SearchRequest("RRTstar", 4.0, seed, "first", None, (0.01, 1000))
-        outcome = search(slalom, lead[0], lead[-1:], request, cost, lead)
-        assert outcome.status == "exact"
+def test_states_of_a_lead_are_nearest_to_the_one_before():
+    """At most a tenth of a step apart: what is nearest past a thin wall is on this side."""
+    si = ob.SpaceInformation(state_space(disk_world.robot()))
+    lead = np.array([(-0.8, -0.8), (-0.5, 0.6), (-0.3, 0.6), (-0.1, -0.6), (0.1, -0.6)])
+    guided = GuidedGoal(si, lead[-1:], 0, 0.5)
+    guided.lead(lead)
+    rows = np.array([lead[0], *guided._queue[::-1]])
+    assert np.linalg.norm(np.diff(rows, axis=0), axis=1).max() <= 0.05 + 1e-9
+    for k in range(1, len(rows)):
+        assert np.argmin(np.linalg.norm(rows[:k] - rows[k], axis=1)) == k - 1
 
 
 @pytest.mark.parametrize(
