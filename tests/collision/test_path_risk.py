@@ -773,3 +773,14 @@ def test_a_bound_on_risk_does_not_let_a_ball_shave_the_level_set(free_world, bal
     for a, b in places[:300].reshape(-1, 2, 3):
         if bounded.check_motion(a, b):
             assert plain.check_motion(a, b)
+
+
+def test_a_wider_margin_keeps_a_tightened_bound(bounded, doubtful):
+    """The bound lives beside the settings, and a checker made anew from them forgot it."""
+    tight = bounded[0.6].tightened(2)
+    wider = tight.with_extra_margin(0.005)
+    Q = np.random.default_rng(12).choice(doubtful, 150)
+    assert not (wider.is_valid_batch(Q) & ~tight.is_valid_batch(Q)).any()
+    assert (bounded[0.6].with_extra_margin(0.005).is_valid_batch(Q)).sum() > (
+        wider.is_valid_batch(Q).sum()
+    )
