@@ -64,7 +64,10 @@ def test_products_and_sums_of_waypoints_measure_the_division(runs):
     sums = [e.per_waypoint.sum() for e in estimates]
     assert all(b > a + 0.02 for a, b in pairwise(products))
     assert all(b > 1.2 * a for a, b in pairwise(sums))
-    # What the product leaves of surviving is less than a hundredth of what there is.
+    for estimate in (runs[0.065][-1], runs[0.07][-1]):
+        assert 1.0 - np.prod(1.0 - estimate.per_waypoint) > 2.0 * estimate.probability
+    # Where P is above one half nothing is twice as much: what the product leaves of surviving
+    # is less than a hundredth of what there is.
     assert 1.0 - products[-1] < 0.01 * (1.0 - estimates[-1].probability)
 
 
