@@ -41,8 +41,7 @@ def plan_widest(
     A map's surface is nowhere exact, least behind what the camera saw; a fixed margin that
     allows for that refuses problems which have no room for it. Here every margin gets an
     equal share of the time that is left, the widest first, and the first path found is
-    returned: with room to spare it keeps away, in a narrow place it goes through
-    (`docs/results/planning.md`: the same successes as without a margin, and fewer collisions).
+    returned: with room to spare it keeps away, in a narrow place it goes through.
 
     Args:
         checker: a `CollisionChecker`, or anything with `with_extra_margin`.
