@@ -41,6 +41,7 @@ _STRAYS = 0.03  # share of neighbours below which a point is a flying pixel, as 
 _LONE = 0.03  # the same of points without a label: `WorldConfig.lone_share` for every contender
 _CELLS = 2  # cells per grid step that observed points mark
 OCTOMAP_OCCUPIED = 1
+RESOLUTION = 0.01  # metres; of every grid unless a contender says otherwise
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class Contender:
             Of several, each gets an equal share of the time limit, and the first with which
             the query succeeds makes the path.
         meshes: whether FCL judges extracted meshes.
+        resolution: of a world of ours, metres.
     """
 
     key: str
@@ -67,6 +69,7 @@ class Contender:
     occluded: OccludedPolicy = "free"
     bounds: tuple[tuple[float, float | None], ...] = ((0.0, None),)
     meshes: bool = False
+    resolution: float = RESOLUTION
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything, ready for JSON."""
@@ -82,6 +85,8 @@ class Contender:
         """Return what its answers depend on: all but how it is called in tables."""
         data = self.to_dict()
         del data["label"], data["line"]
+        if self.resolution == RESOLUTION:  # answers from before there was a choice stay valid
+            del data["resolution"]
         return data
 
 
@@ -106,6 +111,11 @@ def _ours() -> Iterable[Contender]:
                 f"{head}r{round(100 * risk):02d}", f"risk {risk:g}", f"ours, risk ({words})",
                 "vprism", policy, ((0.0, risk),),
             )  # fmt: skip
+    for mm in (0, 5, 10):
+        yield Contender(
+            f"ours-dense-m{mm}", f"{mm} mm", "ours, margin (5 mm grid)", "vprism",
+            bounds=((mm / 1000.0, None),), resolution=0.005,
+        )  # fmt: skip
     steps = tuple((margin, None) for margin in _LADDER)
     yield Contender(
         "ours-widest",
@@ -177,12 +187,12 @@ class Bench:
         self.seed = seed
         self.truth = truth
         self.seconds: dict[str, float] = {}
-        self._worlds: dict[tuple[str, str], Any] = {}
+        self._worlds: dict[tuple[str, str, float], Any] = {}
 
     def checkers(self, contender: Contender) -> tuple[list[Any], float]:
         """Return a contender's checkers, one per bound, and the processor seconds they took
         from the observation on, what others made before included."""
-        name = f"world {contender.map} {contender.occluded}"
+        name = f"world {contender.map} {contender.occluded} {contender.resolution:g}"
         world = self._world(contender, name)
         began = time.process_time()
         made = [self._make(contender, world, *bound) for bound in contender.bounds]
@@ -201,11 +211,12 @@ class Bench:
         return CollisionChecker(world, self.robot, config)
 
     def _world(self, contender: Contender, name: str) -> Any:
-        key = (contender.map, contender.occluded)
+        key = (contender.map, contender.occluded, contender.resolution)
         if key not in self._worlds:
             if contender.map in ("vprism", "sgd"):
                 map_ = self.vprism if contender.map == "vprism" else self.sgd
                 config = WorldConfig(
+                    resolution=contender.resolution,
                     occluded=contender.occluded,
                     bounds=benchmark_bounds(self.observation),
                     lone_share=_LONE,
