@@ -7,7 +7,7 @@ import disk_world
 import pytest
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning import plan
+from vprism_plan.planning import _clock, plan
 
 COMMON = ["RRTConnect", "RRTstar", "InformedRRTstar", "BITstar", "KPIECE1", "AORRTC"]
 START, GOAL = [-0.7, -0.5], [0.7, -0.5]
@@ -57,6 +57,28 @@ def test_both_clocks_give_the_same_path_if_the_search_ends_by_itself(planner):
         for clock in ("wall", "process")
     ]
     assert paths[0].tolist() == paths[1].tolist()
+
+
+class Fickle(disk_world.DiskChecker):
+    """Refuses, once the search has begun, the goal that it accepted before."""
+
+    def is_valid(self, q):
+        return self.clearance(q) > 0.0
+
+    def is_valid_buffer(self, q):
+        return super().is_valid_buffer(q) and q[0] < GOAL[0] - 0.01
+
+
+def test_a_planner_that_sleeps_until_its_goal_is_valid_is_woken_by_the_wall_clock(monkeypatch):
+    """Processor time never passed: a benchmark by that clock hung for ever."""
+    monkeypatch.setattr(_clock, "PATIENCE", 5.0)
+    wall = disk_world.wall_with_gap()
+    checker = Fickle(wall.centers, wall.radii, wall.robot)
+    began = time.perf_counter()
+    result = plan(checker, START, GOAL, time_limit=0.1, clock="process")
+    assert not result.solved
+    assert 0.5 <= time.perf_counter() - began < 5.0
+    assert result.report.planning_time < 0.5
 
 
 def test_an_unknown_clock_is_refused():

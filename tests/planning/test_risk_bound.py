@@ -105,6 +105,28 @@ def test_a_refusal_of_the_tighter_search_keeps_the_path_that_was_found():
     assert result.approximate_path is not None
 
 
+@pytest.mark.parametrize("end", [START, GOAL])
+@pytest.mark.parametrize("clock", ["wall", "process"])
+def test_an_end_that_the_tighter_bound_refuses_is_not_waited_for(end, clock):
+    """OMPL sleeps until a goal is valid: the whole time limit, or for ever by processor time."""
+    checker = RiskyDisks(disk_world.wall_with_gap(), 0.1, 0.9, 1.0, 1)
+    tightened = checker.tightened
+    asked = []
+
+    def cover(level):
+        stricter = tightened(level)
+        stricter.centers = np.concatenate([stricter.centers, [end]])
+        stricter.radii = np.append(stricter.radii, 0.05)
+        stricter.check_motion_buffer = lambda *ends: asked.append(ends) or False
+        return stricter
+
+    checker.tightened = cover
+    result = plan(checker, START, GOAL, time_limit=30.0, clock=clock)
+    assert result.status == "too_risky"
+    assert result.approximate_path is not None
+    assert not asked, "no planner is started between ends that are refused"
+
+
 def test_the_time_limit_ends_the_tightening():
     checker = risky(max_risk=1e-6, first_risk=0.9, gain=1.0, levels=10**6)
     result = plan(checker, START, GOAL, time_limit=0.3)

@@ -12,6 +12,9 @@ from vprism_plan.errors import PlanningError
 Now = Callable[[], float]
 
 # Processor time is that of the whole process, worker threads included.
+# Times the limit after which a search by processor time ends by the wall clock: OMPL sleeps
+# while it waits for goals, which spends none. A machine that busy would be no help anyway.
+PATIENCE = 50.0
 _CLOCKS: dict[str, Now] = {"wall": time.perf_counter, "process": time.process_time}
 
 
@@ -26,10 +29,14 @@ def clock_named(name: str) -> Now:
 
 
 def time_is_up(name: str, seconds: float) -> Any:
-    """Return an OMPL termination condition that holds `seconds` from now on a clock."""
+    """Return an OMPL termination condition that holds `seconds` from now on a clock.
+
+    With processor time it also holds after `PATIENCE` times as much time has passed.
+    """
     if name == "wall":
         # The form without an interval reads the clock itself: no extra thread, no overshoot.
         return ob.timedPlannerTerminationCondition(seconds)
     now = clock_named(name)
     end = now() + seconds
-    return ob.PlannerTerminationCondition(lambda: now() >= end)
+    asleep = time.perf_counter() + PATIENCE * seconds
+    return ob.PlannerTerminationCondition(lambda: now() >= end or time.perf_counter() >= asleep)

@@ -98,7 +98,8 @@ def plan(
             the path is still handed out: the report and the message say so.
         clock: what limits, and all times of the report, are measured by: "wall", or
             "process", the processor time of this process, which makes measurements on a
-            busy machine comparable (a search that waits for nothing takes the same).
+            busy machine comparable (a search that waits for nothing takes the same; one
+            that waits, as for a slow checker, ends after `_clock.PATIENCE` times the limit).
         objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
             objective are accepted; shortening then never raises the cost, and afterwards
             waypoints are moved, within `simplify_time`, where that lowers it. A straight
@@ -142,6 +143,9 @@ def plan(
     finish = _Finish(simplify, float(simplify_time), interpolate, clearance_step, now, cost)
 
     def attempt(judge: CheckerLike, limit: float, number: int) -> PlanResult:
+        # A stricter judge may refuse an end, and OMPL waits for goals that do not come.
+        if number and not (judge.is_valid(q_start) and any(map(judge.is_valid, goals))):
+            return _not_found("timeout", None, report)
         direct = _direct(judge, q_start, goals)
         if direct is not None and (cost is None or _riskless(cost, direct[1])):
             path = finish.resampled(judge, direct[1])
