@@ -14,7 +14,6 @@ import numpy as np
 from numba import njit
 
 UNBAKED = np.int32(-1)  # as in `risk`
-DRAWS, MEANS, PEAKS = 0, 1, 2
 _MAX_TURN = 0.5  # radians per step, as in `checking`
 
 
