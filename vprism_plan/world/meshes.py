@@ -2,22 +2,20 @@
 """Surfaces of the map's objects by marching cubes."""
 
 import logging
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.errors import ConfigError, WorldError
+from vprism_plan.errors import WorldError
 from vprism_plan.world.config import check_level
+from vprism_plan.world.sampling import check_spacing, sample_box
 
 if TYPE_CHECKING:
     import trimesh
 
 _log = logging.getLogger(__name__)
 
-_CHUNK = 1 << 16
-_MAX_NODES = 60_000_000
 # Probability: moves a surface by less than its own discretisation error.
 _PUSHES = (1e-3, 3e-3, 1e-2)
 
@@ -80,27 +78,10 @@ def _sample(
 ) -> tuple[Float[np.ndarray, "nx ny nz k"], Float[np.ndarray, " 3"]]:
     """Class probabilities on a grid over the map's support, with an empty layer round it."""
     check_level(level)
-    if not 1e-4 <= resolution <= 1.0:
-        raise ConfigError(f"resolution is {resolution}; it must be between 0.0001 and 1 metres")
+    check_spacing(resolution, "resolution")
     lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map_.support_bounds())
-    first = np.floor(lower / resolution).astype(np.int64) - 1
-    shape = np.ceil(upper / resolution).astype(np.int64) + 2 - first
-    count = math.prod(int(n) for n in shape)
-    if count > _MAX_NODES:
-        raise ConfigError(
-            f"resolution {resolution} m gives {count:,} samples (at most {_MAX_NODES:,}); "
-            "use a coarser one"
-        )
-    probabilities = np.zeros((count, map_.n_classes), dtype=np.float32)
-    probabilities[:, 0] = 1.0
-    nodes = np.moveaxis(np.indices(tuple(shape)), 0, -1).reshape(-1, 3)
-    inner = np.flatnonzero(((nodes > 0) & (nodes < shape - 1)).all(axis=1))
-    for start in range(0, count, _CHUNK):
-        chosen = inner[start : start + _CHUNK]
-        if len(chosen):
-            points = resolution * (nodes[chosen] + first).astype(np.float64)
-            probabilities[chosen] = map_.predict_proba(points)
-    return probabilities.reshape(*shape, -1), resolution * first
+    probabilities, first = sample_box(map_, lower, upper, resolution, "resolution")
+    return probabilities, resolution * first
 
 
 def surface(

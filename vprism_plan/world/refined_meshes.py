@@ -18,14 +18,13 @@ from jaxtyping import Bool, Float, Int
 from vprism_plan.errors import ConfigError
 from vprism_plan.world.config import check_level
 from vprism_plan.world.meshes import surface
+from vprism_plan.world.sampling import check_size, check_spacing, predicted, sample_box
 
 if TYPE_CHECKING:
     import trimesh
 
 _log = logging.getLogger(__name__)
 
-_CHUNK = 1 << 16
-_MAX_NODES = 60_000_000
 _CORNERS = tuple(itertools.product((0, 1), repeat=3))
 # Outside, for nodes that nobody has to evaluate.
 _NOTHING = -0.1
@@ -53,13 +52,13 @@ def extract_refined_meshes(
         WorldError: a surface could not be closed.
     """
     check_level(level)
-    if not 1e-4 <= spacing <= 1.0:
-        raise ConfigError(f"spacing is {spacing}; it must be between 0.0001 and 1 metres")
+    check_spacing(spacing, "spacing")
     if halvings is None:
         halvings = max(0, math.floor(math.log2(0.5 * map.kernel_length / spacing)))
     if not 0 <= halvings <= 8:
         raise ConfigError(f"halvings is {halvings}; it must be between 0 and 8")
-    probabilities, first = _coarse(map, spacing * 2**halvings)
+    lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map.support_bounds())
+    probabilities, first = sample_box(map, lower, upper, spacing * 2**halvings, "spacing")
     meshes = {}
     for k, object_id in enumerate(map.object_ids, start=1):
         values = _inside(probabilities, k, level)
@@ -74,29 +73,6 @@ def extract_refined_meshes(
         if mesh is not None:
             meshes[object_id] = mesh
     return meshes
-
-
-def _coarse(
-    map_: Any, spacing: float
-) -> tuple[Float[np.ndarray, "nx ny nz k"], Int[np.ndarray, " 3"]]:
-    """Class probabilities over the map's support; the outermost nodes stay empty."""
-    lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map_.support_bounds())
-    first = np.floor(lower / spacing).astype(np.int64) - 1
-    shape = np.ceil(upper / spacing).astype(np.int64) + 2 - first
-    _refuse_size(shape, spacing)
-    probabilities = np.zeros((*(int(n) for n in shape), map_.n_classes), dtype=np.float32)
-    probabilities[..., 0] = 1.0
-    inner = np.moveaxis(np.indices(tuple(shape - 2)), 0, -1).reshape(-1, 3) + 1
-    probabilities[tuple(inner.T)] = _predict(map_, spacing * (inner + first).astype(np.float64))
-    return probabilities, first
-
-
-def _predict(map_: Any, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
-    out = np.empty((len(points), map_.n_classes), dtype=np.float32)
-    for start in range(0, len(points), _CHUNK):
-        piece = slice(start, start + _CHUNK)
-        out[piece] = map_.predict_proba(points[piece])
-    return out
 
 
 def _inside(
@@ -136,7 +112,7 @@ def _halved(
     `halvings` still to come, this one included; `corner` in steps of the given grid; if
     `wide`, the cells around those in which the surface runs are evaluated, too.
     """
-    _refuse_size(2 * np.array(values.shape), spacing)
+    check_size(2 * np.array(values.shape), spacing, "spacing")
     mixed = _mixed(values, wide)
     fine = _between(values)
     wanted = np.zeros(fine.shape, dtype=bool)
@@ -146,7 +122,7 @@ def _halved(
     nodes = np.argwhere(wanted)
     corner = 2 * corner
     points = (spacing * 2 ** (halvings - 1)) * (nodes + corner).astype(np.float64)
-    fine[tuple(nodes.T)] = _inside(_predict(map_, points), k, level)
+    fine[tuple(nodes.T)] = _inside(predicted(map_, points), k, level)
     for axis in range(3):
         for end in (0, -1):
             face = np.moveaxis(fine, axis, 0)[end]
@@ -178,12 +154,3 @@ def _between(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "mx my 
         fine[1::2] = 0.5 * (along[:-1] + along[1:])
         values = np.moveaxis(fine, 0, axis)
     return np.ascontiguousarray(values)
-
-
-def _refuse_size(shape: Int[np.ndarray, " 3"], spacing: float) -> None:
-    count = math.prod(int(n) for n in shape)
-    if count > _MAX_NODES:
-        raise ConfigError(
-            f"spacing {spacing} m gives {count:,} samples (at most {_MAX_NODES:,}); "
-            "use a coarser one"
-        )

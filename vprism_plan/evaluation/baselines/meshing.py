@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Surfaces of the objects that any method reconstructs, by marching cubes."""
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,11 +10,11 @@ from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.evaluation.protocols import Reconstruction
 from vprism_plan.world.config import check_level
 from vprism_plan.world.meshes import surface
+from vprism_plan.world.sampling import check_spacing, sample_box
 
 if TYPE_CHECKING:
     import trimesh
 
-_CHUNK = 1 << 16
 _MAX_NODES = 20_000_000
 _RISES = (0.0, 0.003, 0.01, 0.03)  # probability
 
@@ -44,18 +43,11 @@ def meshes_of(
         WorldError: a surface could not be closed.
     """
     check_level(level)
-    if not 1e-4 <= resolution <= 1.0:
-        raise ConfigError(f"resolution is {resolution}; it must be between 0.0001 and 1 metres")
+    check_spacing(resolution, "resolution")
     lower, upper = _box(reconstruction, bounds)
-    first = np.floor(lower / resolution).astype(np.int64) - 1
-    shape = np.ceil(upper / resolution).astype(np.int64) + 2 - first
-    count = math.prod(int(n) for n in shape)
-    if count > _MAX_NODES:
-        raise ConfigError(
-            f"resolution {resolution} m gives {count:,} samples (at most {_MAX_NODES:,}); "
-            "use a coarser one"
-        )
-    probabilities = _sample(reconstruction, first, shape, resolution)
+    probabilities, first = sample_box(
+        reconstruction, lower, upper, resolution, "resolution", _MAX_NODES
+    )
     found = {}
     for k, object_id in enumerate(reconstruction.object_ids, start=1):
         mesh = _closed(probabilities[..., k] - np.float32(level), resolution * first, resolution)
@@ -100,19 +92,3 @@ def _box(
             "with every lower coordinate below the upper one"
         )
     return box[0], box[1]
-
-
-def _sample(
-    reconstruction: Reconstruction, first: np.ndarray, shape: np.ndarray, resolution: float
-) -> Float[np.ndarray, "nx ny nz k"]:
-    """Probabilities at the nodes, empty in the outermost layer."""
-    classes = len(reconstruction.object_ids) + 1
-    probabilities = np.zeros((*shape, classes), dtype=np.float32)
-    probabilities[..., 0] = 1.0
-    inner = np.moveaxis(np.indices(tuple(shape - 2)), 0, -1).reshape(-1, 3) + 1
-    values = np.empty((len(inner), classes), dtype=np.float32)
-    for start in range(0, len(inner), _CHUNK):
-        points = resolution * (inner[start : start + _CHUNK] + first).astype(np.float64)
-        values[start : start + _CHUNK] = reconstruction.predict_proba(points)
-    probabilities[1:-1, 1:-1, 1:-1] = values.reshape(*(shape - 2), classes)
-    return probabilities
