@@ -14,8 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.small_scenes import small_config, small_scene
 
+from vprism_plan.collision import CheckerConfig
 from vprism_plan.errors import ConfigError
-from vprism_plan.evaluation.experiments.sweep import Case
+from vprism_plan.evaluation.experiments.sweep import Case, SweepError
 from vprism_plan.evaluation.planning_benchmark import (
     CONTENDERS,
     Answer,
@@ -24,10 +25,12 @@ from vprism_plan.evaluation.planning_benchmark import (
     PathTruth,
     Problem,
     Truth,
+    asking,
     contenders,
     report,
 )
 from vprism_plan.evaluation.planning_benchmark.checkers import Bench, known_nodes
+from vprism_plan.evaluation.planning_benchmark.contenders import settings
 from vprism_plan.evaluation.planning_benchmark.fcl_checker import bisected
 from vprism_plan.evaluation.planning_benchmark.grid_world import benchmark_grid, benchmark_robot
 from vprism_plan.evaluation.planning_benchmark.ompl_log import log_text
@@ -37,10 +40,11 @@ from vprism_plan.evaluation.planning_benchmark.summary import (
     statements,
     successes_at,
 )
-from vprism_plan.mapping import fit_map
+from vprism_plan.mapping import MapConfig, fit_map
 from vprism_plan.world.visibility import background_points
 
-# The package's name `run` is the function.
+# The package's names `contenders` and `run` are functions.
+contending = importlib.import_module("vprism_plan.evaluation.planning_benchmark.contenders")
 running = importlib.import_module("vprism_plan.evaluation.planning_benchmark.run")
 
 
@@ -174,19 +178,20 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
     no, far = (False, False), (1.0, 1.0)
     problems = [Problem(k, tuple(Q[2 * k]), tuple(Q[2 * k + 1]), no, far, seed=k) for k in (0, 1)]
     asked = []
-    monkeypatch.setattr(running, "_truth", lambda *_: truth)
-    monkeypatch.setattr(running, "_bench", lambda *_: Bench(scene, truth.robot, 0, truth.world))
+    monkeypatch.setattr(asking, "_truth", lambda *_: truth)
+    monkeypatch.setattr(asking, "_bench", lambda *_: Bench(scene, truth.robot, 0, truth.world))
     monkeypatch.setattr(
-        running, "find_problems", lambda *given: asked.append(given[1:3]) or problems
+        asking, "find_problems", lambda *given: asked.append(given[1:3]) or problems
     )
-    real = running.ask
-    monkeypatch.setattr(running, "ask", lambda *given: asked.append("ask") or real(*given))
+    real = asking.ask
+    monkeypatch.setattr(asking, "ask", lambda *given: asked.append("ask") or real(*given))
     options = {"checkers": ["truth", "points"], "count": 2, "store": tmp_path, "jobs": 1}
     first = running.run("solids", 1, 7, progress=False, **options)
     assert asked == [(2, 7), "ask", "ask", "ask", "ask"]
-    assert running.run("solids", 1, 7, progress=False, **options) == first
+    again = running.run("solids", 1, 7, progress=False, **options)
+    assert again.answers == first.answers
     assert len(asked) == 5
-    (entry, other) = first
+    (entry, other) = first.answers
     assert (entry["contender"], other["contender"]) == ("truth", "points")
     for found in entry["answers"]:
         answer = Answer.from_dict(found)
@@ -198,15 +203,74 @@ def test_a_run_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
         running.run("solids", 0)
 
 
+def stub_sweeps(monkeypatch, offers, fails=()):
+    """Let scene k offer offers[k] problems, and a contender raise on some scenes."""
+
+    def sweep(task, cases, store, **options):
+        cases = list(cases)
+        if task is asking.problem_case:
+            return [{"problems": [{}] * offers[case.asked["seed"]]} for case in cases]
+        lost = [
+            case for case in cases if (case.asked["contender"]["key"], case.asked["seed"]) in fails
+        ]
+        if lost:
+            raise SweepError([SimpleNamespace(name=c.name, error="no", trace="") for c in lost], 9)
+        return [{"contender": c.asked["contender"]["key"], "seed": c.asked["seed"]} for c in cases]
+
+    monkeypatch.setattr(running, "sweep", sweep)
+
+
+def test_scenes_that_offer_too_few_problems_are_replaced_and_named(tmp_path, monkeypatch):
+    """One of ten scenes once counted as twenty problems, half of them hidden; it had ten."""
+    stub_sweeps(monkeypatch, {7: 3, 8: 1, 9: 3, 10: 0, 11: 3, 12: 3})
+    options = {"checkers": ["truth"], "count": 3, "store": tmp_path}
+    found = running.run("solids", 3, 7, **options)
+    assert [entry["seed"] for entry in found.answers] == [7, 9, 11]
+    assert found.replaced == {8: 1, 10: 0}
+    assert found.failed is None
+    stub_sweeps(monkeypatch, dict.fromkeys(range(7, 13), 2))
+    with pytest.raises(ConfigError, match=r"solids scenes 7 to 12 only 0 offer 3 problems"):
+        running.run("solids", 3, 7, **options)
+
+
+def test_a_scene_on_which_one_contender_fails_counts_for_none(tmp_path, monkeypatch):
+    stub_sweeps(monkeypatch, dict.fromkeys(range(20), 2), fails=[("points", 8)])
+    options = {"checkers": ["truth", "points"], "count": 2, "store": tmp_path}
+    found = running.run("solids", 2, 7, **options)
+    assert [(e["contender"], e["seed"]) for e in found.answers] == [("truth", 7), ("points", 7)]
+    assert [failure.name for failure in found.failed.failures] == ["points solids 8"]
+    with pytest.raises(SweepError):
+        running.run("solids", 1, 8, **options)
+
+
+@pytest.mark.parametrize("scenes", [-5, 0, 1])
+def test_fewer_scenes_than_sets_are_refused(tmp_path, scenes):
+    """They once became one scene of each set."""
+    with pytest.raises(ConfigError, match=f"scenes is {scenes} for 2 sets"):
+        report.benchmark(("solids", "ycb"), scenes, output=tmp_path, store=tmp_path)
+
+
+def test_an_answer_depends_on_the_settings_of_the_package(monkeypatch):
+    """Answers of a former default map were once taken for those of today's."""
+    before = {key: settings(chosen) for key, chosen in CONTENDERS.items()}
+    assert json.loads(json.dumps(before)).keys() == before.keys()
+    monkeypatch.setattr(contending, "MapConfig", MapConfig.fine)
+    changed = {key for key, chosen in CONTENDERS.items() if settings(chosen) != before[key]}
+    assert changed == {k for k, c in CONTENDERS.items() if c.map in ("vprism", "sgd")}
+    strict = dataclasses.replace(CheckerConfig(), margin=0.01)
+    monkeypatch.setattr(contending, "CheckerConfig", lambda: strict)
+    assert all(settings(chosen) != before[key] for key, chosen in CONTENDERS.items())
+
+
 def test_a_refusal_says_what_is_in_the_way():
     contact = SimpleNamespace(kind="object", body="object:3", link="hand")
     refused = SimpleNamespace(
         status="invalid_goal", explanation=SimpleNamespace(contacts=[contact])
     )
-    assert running._refusal(refused) == "object:3"
+    assert asking._refusal(refused) == "object:3"
     contact.kind = "risk"
-    assert running._refusal(refused) == "risk"
-    assert running._refusal(SimpleNamespace(status="timeout")) == ""
+    assert asking._refusal(refused) == "risk"
+    assert asking._refusal(SimpleNamespace(status="timeout")) == ""
     assert isinstance(Case("x", {}), Case)
 
 
@@ -292,7 +356,8 @@ def test_figures_add_up_and_are_written(tmp_path):
     about = {
         "kinds": {"solids": 6}, "first_seed": 0, "count": 10,
         "command": "vprism-plan eval planning",
-        "criteria": running.Criteria().to_dict(), "limits": vars(Limits()), "commit": "0",
+        "criteria": running.Criteria().to_dict(), "limits": vars(Limits()), "commits": ["0", "1+"],
+        "replaced": {"solids": {"3": 7}}, "left_out": ["fcl solids 9: RuntimeError: no"],
     }  # fmt: skip
     figures, files = report.write_report(found, about, tmp_path)
     assert {f.name for f in files} == {p.name for p in tmp_path.iterdir()}
@@ -300,6 +365,8 @@ def test_figures_add_up_and_are_written(tmp_path):
     text = (tmp_path / "planning.md").read_text()
     assert "At the success rate of meshes with FCL" in text
     assert "vprism-plan eval planning" in text
+    for said in ("Computed at 0, 1+", "solids 3 (7)", "- fcl solids 9: RuntimeError: no"):
+        assert said in text
     with pytest.raises(ConfigError, match="fcl was not asked"):
         outcomes([e for e in found if (e["contender"], e["seed"]) != ("fcl", 2)])
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Does it get safer? The same planner with different maps, judged by the true scene."""
 
-from vprism_plan.evaluation.planning_benchmark.checkers import CONTENDERS, Contender, contenders
+from vprism_plan.evaluation.planning_benchmark.asking import Answer, Limits
+from vprism_plan.evaluation.planning_benchmark.contenders import CONTENDERS, Contender, contenders
 from vprism_plan.evaluation.planning_benchmark.problems import Criteria, Problem, find_problems
-from vprism_plan.evaluation.planning_benchmark.run import Answer, Limits, run
+from vprism_plan.evaluation.planning_benchmark.run import Found, run
 from vprism_plan.evaluation.planning_benchmark.truth import PathTruth, Truth
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "Answer",
     "Contender",
     "Criteria",
+    "Found",
     "Limits",
     "PathTruth",
     "Problem",

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Who is compared: the same planner, robot and support plane with different worlds.
+"""The worlds and checkers of all contenders in one scene.
 
 All but the mesh checker are worlds of the same `CollisionChecker`, so only the map and what
 it says of unseen space differ. All see the same observation.
 """
 
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +17,7 @@ from vprism_plan._kernels import world as kernels
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.baselines import method
+from vprism_plan.evaluation.planning_benchmark.contenders import LONE, STRAYS, Contender
 from vprism_plan.evaluation.planning_benchmark.grid_world import (
     GridWorld,
     benchmark_bounds,
@@ -34,135 +34,11 @@ from vprism_plan.world.config import OccludedPolicy
 from vprism_plan.world.distance import Lattice
 from vprism_plan.world.visibility import background_points, depth_sigma
 
-__all__ = ["CONTENDERS", "Bench", "Contender", "contenders"]
+__all__ = ["Bench", "known_nodes"]
 
 _OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things
-_STRAYS = 0.03  # share of neighbours below which a point is a flying pixel, as in the map
-_LONE = 0.03  # the same of points without a label: `WorldConfig.lone_share` for every contender
 _CELLS = 2  # cells per grid step that observed points mark
 OCTOMAP_OCCUPIED = 1
-RESOLUTION = 0.01  # metres; of every grid unless a contender says otherwise
-
-
-@dataclass(frozen=True)
-class Contender:
-    """One row of the benchmark.
-
-    Attributes:
-        key: short name.
-        label: name in tables and pictures.
-        line: contenders of one line differ in one parameter only.
-        map: "vprism", "sgd", "points", "octomap" or "truth".
-        occluded: what a world of ours, or of the point estimate, does with occluded space;
-            of OctoMap: whether unknown voxels in the image are obstacles.
-        bounds: (margin in metres, bound on the collision probability or None) to plan with.
-            Of several, each gets an equal share of the time limit, and the first with which
-            the query succeeds makes the path.
-        meshes: whether FCL judges extracted meshes.
-        resolution: of a world of ours, metres.
-    """
-
-    key: str
-    label: str
-    line: str
-    map: str
-    occluded: OccludedPolicy = "free"
-    bounds: tuple[tuple[float, float | None], ...] = ((0.0, None),)
-    meshes: bool = False
-    resolution: float = RESOLUTION
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Contender":
-        """Rebuild from `to_dict`, or from `question`."""
-        words = {"label": data["key"], "line": data["key"]}
-        return cls(**{**words, **data, "bounds": tuple((m, r) for m, r in data["bounds"])})
-
-    def question(self) -> dict[str, Any]:
-        """Return what its answers depend on: all but how it is called in tables."""
-        data = self.to_dict()
-        del data["label"], data["line"]
-        if self.resolution == RESOLUTION:  # answers from before there was a choice stay valid
-            del data["resolution"]
-        return data
-
-
-def _ours() -> Iterable[Contender]:
-    """Level sets with margins and bounds on risk, by what occluded space is taken for."""
-    policies: tuple[tuple[OccludedPolicy, str, str], ...] = (
-        ("occupied", "all", "hidden: obstacle"),
-        ("posterior", "beyond", "hidden: obstacle beyond support"),
-        ("free", "", "hidden: the map decides"),
-    )
-    margins = {"occupied": (0,), "posterior": (0, 10), "free": (0, 5, 10, 20, 30)}
-    risks = {"occupied": (), "posterior": (0.05,), "free": (0.01, 0.05, 0.2, 0.5)}
-    for policy, short, words in policies:
-        head = f"ours-{short}-" if short else "ours-"
-        for mm in margins[policy]:
-            yield Contender(
-                f"{head}m{mm}", f"{mm} mm", f"ours, margin ({words})", "vprism", policy,
-                ((mm / 1000.0, None),),
-            )  # fmt: skip
-        for risk in risks[policy]:
-            yield Contender(
-                f"{head}r{round(100 * risk):02d}", f"risk {risk:g}", f"ours, risk ({words})",
-                "vprism", policy, ((0.0, risk),),
-            )  # fmt: skip
-    for mm in (0, 5, 10):
-        yield Contender(
-            f"ours-dense-m{mm}", f"{mm} mm", "ours, margin (5 mm grid)", "vprism",
-            bounds=((mm / 1000.0, None),), resolution=0.005,
-        )  # fmt: skip
-    steps = tuple((margin, None) for margin in _LADDER)
-    yield Contender(
-        "ours-widest",
-        "ours, widest margin that works",
-        "ours, widest margin that works",
-        "vprism",
-        "free",
-        steps,
-    )
-
-
-_LADDER = (0.02, 0.01, 0.005, 0.0)  # metres
-CONTENDERS: dict[str, Contender] = {
-    entry.key: entry
-    for entry in (
-        Contender("truth", "the truth itself", "truth", "truth"),
-        *_ours(),
-        Contender("fcl", "plain", "meshes with FCL", "vprism", meshes=True),
-        Contender(
-            "fcl-m10", "links padded by 10 mm", "meshes with FCL", "vprism",
-            bounds=((0.01, None),), meshes=True,
-        ),
-        Contender("points", "point cloud", "points", "points"),
-        Contender("octomap-free", "OctoMap, unknown free", "octomap-free", "octomap"),
-        Contender(
-            "octomap-occupied", "OctoMap, unknown occupied", "octomap-occupied", "octomap",
-            "occupied",
-        ),
-        Contender("sgd", "SGD point estimate", "sgd", "sgd"),
-    )
-}  # fmt: skip
-
-
-def contenders(keys: Iterable[str] | None = None) -> tuple[Contender, ...]:
-    """Return the contenders of these keys (all if None); ConfigError naming the keys."""
-    chosen = tuple(CONTENDERS) if keys is None else tuple(keys)
-    for key in chosen:
-        if key not in CONTENDERS:
-            raise ConfigError(f"there is no checker {key!r}; valid: {', '.join(CONTENDERS)}")
-    return tuple(CONTENDERS[key] for key in chosen)
-
-
-def full_label(contender: Contender) -> str:
-    """Return a contender's name where its line does not stand beside it."""
-    if contender.line in (contender.label, contender.key):
-        return contender.label
-    return f"{contender.line}, {contender.label}"
 
 
 class Bench:
@@ -204,7 +80,8 @@ class Bench:
         if contender.meshes:
             from vprism_plan.evaluation.planning_benchmark.fcl_checker import FclChecker
 
-            return FclChecker(world, self.robot.with_padding(margin) if margin else self.robot)
+            robot = self.robot.with_padding(margin) if margin else self.robot
+            return FclChecker(world, robot, contender.step)
         # 256 worlds without a collision cannot show a risk below 0.0148.
         draws = 512 if risk is not None and risk < 0.015 else 256
         config = CheckerConfig(margin=margin, max_risk=risk, n_worlds=draws)
@@ -219,7 +96,7 @@ class Bench:
                     resolution=contender.resolution,
                     occluded=contender.occluded,
                     bounds=benchmark_bounds(self.observation),
-                    lone_share=_LONE,
+                    lone_share=LONE,
                 )
                 make: Callable[[], Any] = lambda: World(map_, config)  # noqa: E731
             elif contender.map == "points":
@@ -287,8 +164,8 @@ class Bench:
         keep = labels > 0
         for own in np.unique(labels[keep]):
             rows = np.flatnonzero(labels == own)
-            keep[rows] = ~stray_points(points[rows], _STRAYS)
-        others, _ = background_points([view], support_plane(view), _OFF_TABLE, _LONE)
+            keep[rows] = ~stray_points(points[rows], STRAYS)
+        others, _ = background_points([view], support_plane(view), _OFF_TABLE, LONE)
         points = np.concatenate([points[keep], others])
         labels = np.concatenate([labels[keep], np.zeros(len(others), dtype=labels.dtype)])
         return points, labels, (points - view.camera_center) @ view.pose[:3, 2]

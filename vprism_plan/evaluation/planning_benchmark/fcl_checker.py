@@ -5,7 +5,7 @@ The verdicts are those of `MeshChecker`. A distance field of the same level set,
 says more than the true distance to the meshes, answers first: what it calls free is free for
 FCL too, and only the rest is asked of FCL. That changes no verdict on a configuration and
 makes FCL fast enough for the same time limit as the others. Edges that the field cannot
-clear are checked at configurations between which no point of the robot moves more than 5 mm.
+clear are checked at configurations between which no point of the robot moves more than a step.
 """
 
 from dataclasses import dataclass
@@ -23,8 +23,6 @@ from vprism_plan.robots import Robot
 from vprism_plan.world import World
 
 __all__ = ["FclChecker"]
-
-_STEP = 0.005  # metres of motion between two configurations of an edge
 
 
 @dataclass(frozen=True)
@@ -46,9 +44,11 @@ class FclChecker:
     Args:
         world: a `World` with `occluded="free"`: its level set, and the support surface.
         robot: its collision spheres are FCL's shapes, as every other checker sees it.
+        step: motion between two configurations of an edge, metres.
     """
 
-    def __init__(self, world: World, robot: Robot) -> None:
+    def __init__(self, world: World, robot: Robot, step: float = 0.005) -> None:
+        self._step = step
         self.robot = robot
         self.meshes = MeshChecker(world, robot, links="spheres")
         self._field = CollisionChecker(world, robot)
@@ -73,7 +73,7 @@ class FclChecker:
         if self._field.check_motion_buffer(qa, qb):
             return True
         delta = interpolate(self.robot, qa, qb, 1.0) - qa
-        pieces = max(1, int(np.ceil(self.meshes.placed.motion_bound(delta) / _STEP)))
+        pieces = max(1, int(np.ceil(self.meshes.placed.motion_bound(delta) / self._step)))
         return all(
             self.is_valid_buffer(interpolate(self.robot, qa, qb, k / pieces))
             for k in bisected(pieces)
@@ -94,7 +94,7 @@ class FclChecker:
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> Any:
         """Return the verdict on an edge, and how far apart it was looked at."""
-        return DiscreteReport(self.check_motion(qa, qb), False, 0.5 * _STEP)
+        return DiscreteReport(self.check_motion(qa, qb), False, 0.5 * self._step)
 
 
 def bisected(pieces: int) -> list[int]:

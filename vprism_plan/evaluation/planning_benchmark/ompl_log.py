@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from vprism_plan._files import write_text
-from vprism_plan.evaluation.planning_benchmark.checkers import full_label
-from vprism_plan.evaluation.planning_benchmark.run import Answer, Limits
+from vprism_plan.evaluation.planning_benchmark.asking import Answer, Limits
+from vprism_plan.evaluation.planning_benchmark.contenders import full_label
 from vprism_plan.evaluation.planning_benchmark.summary import Outcome
 
 __all__ = ["log_text", "write_log"]

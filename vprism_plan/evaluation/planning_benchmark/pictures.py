@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vprism_plan.evaluation.planning_benchmark.checkers import full_label
+from vprism_plan.evaluation.planning_benchmark.contenders import full_label
 from vprism_plan.evaluation.planning_benchmark.summary import OURS, Outcome, front
 from vprism_plan.viz._figures import new_figure
 

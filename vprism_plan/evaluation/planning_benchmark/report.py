@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from vprism_plan._files import write_text
-from vprism_plan.evaluation.planning_benchmark.checkers import full_label
+from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.planning_benchmark.asking import Limits
+from vprism_plan.evaluation.planning_benchmark.contenders import full_label
 from vprism_plan.evaluation.planning_benchmark.ompl_log import write_log
 from vprism_plan.evaluation.planning_benchmark.problems import Criteria
-from vprism_plan.evaluation.planning_benchmark.run import Limits, run
+from vprism_plan.evaluation.planning_benchmark.run import Found, run
 from vprism_plan.evaluation.planning_benchmark.summary import (
     DEEP,
     REFERENCE,
@@ -65,36 +67,46 @@ def benchmark(
 
     Returns:
         The figures, ready for JSON, and the files written.
+
+    Raises:
+        ConfigError: fewer scenes than kinds; or as `run`.
+        SweepError: some scenes failed; the report is written without them, and names them.
     """
     chosen = None if checkers is None else tuple(checkers)
     limits = Limits() if limits is None else limits
     criteria = Criteria() if criteria is None else criteria
-    share = [scenes // len(kinds) + (i < scenes % len(kinds)) for i in range(len(kinds))]
-    found = []
-    for kind, own in zip(kinds, share, strict=True):
-        found += run(
-            kind, max(1, own), first_seed, checkers=chosen, count=count, criteria=criteria,
+    if not kinds or scenes < len(kinds):
+        raise ConfigError(
+            f"scenes is {scenes} for {len(kinds)} sets ({', '.join(kinds)}); scenes are shared out "
+            "among the sets, and each needs at least one"
+        )
+    found: dict[str, Found] = {}
+    for number, kind in enumerate(kinds):
+        own = scenes // len(kinds) + (number < scenes % len(kinds))
+        found[kind] = run(
+            kind, own, first_seed, checkers=chosen, count=count, criteria=criteria,
             limits=limits, store=store, data=data if kind in ("ycb", "folder") else None,
             jobs=jobs, backend=backend, progress=progress, cluster=cluster,
         )  # fmt: skip
+    answers = [entry for own in found.values() for entry in own.answers]
+    failures = [own.failed for own in found.values() if own.failed is not None]
     about = {
-        "kinds": {kind: max(1, own) for kind, own in zip(kinds, share, strict=True)},
+        "kinds": {
+            kind: len({entry["seed"] for entry in own.answers}) for kind, own in found.items()
+        },
+        "replaced": {
+            kind: {str(seed): offered for seed, offered in own.replaced.items()}
+            for kind, own in found.items()
+        },
+        "left_out": [f"{f.name}: {f.error}" for error in failures for f in error.failures],
         "first_seed": first_seed, "count": count, "criteria": criteria.to_dict(),
-        "limits": vars(limits), "command": command, "commit": commit(),
+        "limits": vars(limits), "command": command,
+        "commits": sorted({entry["commit"] for entry in answers}),
     }  # fmt: skip
-    return write_report(found, about, output)
-
-
-def commit() -> str:
-    """Return the checkout's commit with "+" if something has changed since; "" without one."""
-    import subprocess
-
-    root = Path(__file__).resolve().parents[3]
-    try:
-        words = ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--exclude=*"]
-        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""
+    figures, files = write_report(answers, about, output)
+    if failures:
+        raise failures[0]
+    return figures, files
 
 
 def write_report(
@@ -104,7 +116,8 @@ def write_report(
 
     Args:
         found: answers of `run`.
-        about: what was asked: kinds, first_seed, count, criteria, limits, command, commit.
+        about: what was asked: kinds, (scenes of each), replaced, left_out, first_seed,
+            count, criteria, limits, command, commits.
         output: the folder.
     """
     from vprism_plan.evaluation.planning_benchmark.pictures import curve_figure, fates_figure
@@ -152,7 +165,8 @@ def markdown(figures: dict[str, Any], found: Sequence[Outcome]) -> str:
         f"{about['first_seed']}), {about['count']} problems each. Every returned path is judged "
         "by the true scene. Reprint with", "",
         f"    {about['command']}", "",
-        f'Computed at commit {about["commit"]} ("+": with changes since).', "",
+        f'Computed at {", ".join(about["commits"])} ("+": with uncommitted changes).', "",
+        *_exceptions(about),
         "## What holds", "",
         *[f"- {_sentence(s)}" for s in statements(found)], "",
         f"![Success against true collisions]({KEY}.png)", "",
@@ -161,6 +175,25 @@ def markdown(figures: dict[str, Any], found: Sequence[Outcome]) -> str:
         *_explanation(about),
     ]  # fmt: skip
     return "\n".join(lines)
+
+
+def _exceptions(about: dict[str, Any]) -> list[str]:
+    """Which scenes are not those that the seeds say, and why."""
+    lines = []
+    short = [
+        f"{kind} {seed} ({offered})"
+        for kind, own in about["replaced"].items()
+        for seed, offered in own.items()
+    ]
+    if short:
+        lines += [
+            f"Scenes that offer fewer than {about['count']} such problems, replaced by the next "
+            f"seeds: {', '.join(short)}.", "",
+        ]  # fmt: skip
+    if about["left_out"]:
+        lines += ["Left out for everybody, since somebody failed there:", ""]
+        lines += [*[f"- {line}" for line in about["left_out"]], ""]
+    return lines
 
 
 def _sentence(s: Statement) -> str:
@@ -274,10 +307,13 @@ def _explanation(about: dict[str, Any]) -> list[str]:
         f"shortening (at most {limits['simplify_time']:g} s); the same seed for everybody.",
         "- **Truth**: exact distances of the spheres to the true meshes and the table at samples "
         "with at most 2 mm of motion between them. Any penetration is a collision.",
-        "- **Everybody** knows the support plane and takes space outside the image as free. All "
-        "but the mesh checker are worlds of the same checker on the same nodes, 1 cm apart.",
+        "- **Everybody** has a support plane fitted to the image and takes space outside the image "
+        "as free. All but the mesh checker are worlds of the same checker on the same nodes, 1 cm "
+        "apart.",
         "- **ours**: the default map; occluded space is an obstacle (the package's default), an "
-        "obstacle only beyond the map's support, or the map's to decide. *margin*: distance to "
+        "obstacle only beyond the map's support, or the map's to decide. Single unlabelled "
+        "points in the air are left out (`lone_share=0.03`, for everybody; the package's default "
+        "keeps them as obstacles). *margin*: distance to "
         "the level set 0.5. *risk*: the bound on the joint probability of collision. *widest "
         "margin*: 20, 10, 5 and 0 mm are tried in turn, each for a quarter of the time. *5 mm "
         "grid*: the same level set; distances between nodes are lower bounds, which lose up to "

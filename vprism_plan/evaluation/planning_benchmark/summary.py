@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.experiments.intervals import Estimate, Statistic, ratio
-from vprism_plan.evaluation.planning_benchmark.checkers import CONTENDERS, Contender
-from vprism_plan.evaluation.planning_benchmark.run import Answer
+from vprism_plan.evaluation.planning_benchmark.asking import Answer
+from vprism_plan.evaluation.planning_benchmark.contenders import CONTENDERS, Contender
 
 __all__ = ["OURS", "Outcome", "Statement", "outcomes", "statements"]
 
