@@ -50,8 +50,45 @@ def method_question(key: str) -> dict[str, Any]:
 
 def scene_question(kind: str, seed: int, data: Path | None = None) -> dict[str, Any]:
     """Return what a generated scene depends on."""
-    folder = None if data is None or kind not in ("ycb", "folder") else str(data)
-    return {"set": kind, "seed": seed, "data": folder, "version": SCENES}
+    return {"set": kind, "seed": seed, "data": data_digest(kind, data), "version": SCENES}
+
+
+def data_digest(kind: str, data: Path | None = None) -> str | None:
+    """Return a digest of the meshes that were chosen for a set: their names and contents.
+
+    None where nothing was chosen (see `generation.sources.chosen_folder`). Where a folder
+    lies is no part of it: answers hold on any machine that has the same meshes.
+
+    Raises:
+        ConfigError: the folder is missing or holds no mesh.
+    """
+    from vprism_plan.evaluation.generation.sources import chosen_folder, meshes_in
+
+    folder = chosen_folder(kind, data)
+    if folder is None:
+        return None
+    digest = hashlib.sha256()
+    meshes = meshes_in(folder)
+    buffers = [path for path in folder.rglob("*") if path.suffix.lower() == ".bin"]  # of glTF
+    for path in sorted((*meshes, *buffers)):
+        found = path.stat()
+        content = _content(path, found.st_size, found.st_mtime_ns)
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{content}\0".encode())
+    return digest.hexdigest()[:20]
+
+
+@lru_cache(maxsize=4096)
+def _content(path: Path, size: int, changed: int) -> str:
+    """Return the digest of a file, read again when size or time of change differ."""
+    return f"{size} {hashlib.sha256(path.read_bytes()).hexdigest()}"
+
+
+def whereabouts(kind: str, data: Path | None = None) -> dict[str, Any]:
+    """Return where the chosen meshes of a set lie: what a case is `given`, not asked."""
+    from vprism_plan.evaluation.generation.sources import chosen_folder
+
+    folder = chosen_folder(kind, data)
+    return {} if folder is None else {"data": str(folder)}
 
 
 def cases(
@@ -59,12 +96,15 @@ def cases(
 ) -> list[Case]:
     """Return one case per scene and method, those of a scene next to each other."""
     questions = [(key, method_question(key)) for key in methods]
+    given = whereabouts(kind, data)
     return [
         Case(
             f"{kind}-{seed}-{key}",
-            {"scene": scene_question(kind, seed, data), "method": question, "scores": SCORES},
+            {"scene": scene, "method": question, "scores": SCORES},
+            given,
         )
         for seed in seeds
+        for scene in [scene_question(kind, seed, data)]
         for key, question in questions
     ]
 
@@ -87,7 +127,7 @@ def score(case: Case) -> dict[str, Any]:
 
 def scored(case: Case, chosen: Method) -> dict[str, Any]:
     """Return the answer of `score` for any method, on the scene that a case asks for."""
-    scene, truth = _prepared(**case.asked["scene"])
+    scene, truth = prepared(case)
     began = time.process_time()
     found = _Timed(chosen.fit(scene.observation, scene.seed))
     fit_seconds = time.process_time() - began
@@ -105,12 +145,20 @@ def scored(case: Case, chosen: Method) -> dict[str, Any]:
     }
 
 
+def prepared(case: Case) -> tuple[TrueScene, SceneTruth]:
+    """Return the scene that a case asks for, and its truth."""
+    asked = case.asked["scene"]
+    return _prepared(asked["set"], asked["seed"], asked["data"], case.given.get("data"))
+
+
 @lru_cache(maxsize=1)
-def _prepared(set: str, seed: int, data: str | None, version: int) -> tuple[TrueScene, SceneTruth]:
+def _prepared(
+    kind: str, seed: int, digest: str | None, folder: str | None
+) -> tuple[TrueScene, SceneTruth]:
     """Make a scene and its truth once for all methods that follow each other."""
     from vprism_plan.evaluation.generation import generate
 
-    scene = generate(set, seed, data=None if data is None else Path(data))
+    scene = generate(kind, seed, data=None if folder is None else Path(folder))
     return scene, SceneTruth.of(scene)
 
 

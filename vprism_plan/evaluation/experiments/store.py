@@ -4,7 +4,7 @@
 import hashlib
 import json
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,13 @@ class Case:
         asked: JSON values that hold the whole question: seeds, configurations, data, and
             a version number of every piece of code whose meaning may change. Two cases
             that ask the same have the same answer.
+        given: what the task needs besides and no answer depends on, and so no part of the
+            question: where on this machine the files lie whose digest is asked, say.
     """
 
     name: str
     asked: dict[str, Any]
+    given: dict[str, Any] = field(default_factory=dict)
 
 
 class Store:

@@ -80,6 +80,7 @@ def compare(
                 "config": asdict(config),
                 "scores": scoring.SCORES,
             },
+            scoring.whereabouts(kind),
         )
         for seed in seeds
         for name, config in settings.items()

@@ -8,6 +8,7 @@ generated scenes, where the truth is known, and on those frames, where visibilit
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +101,7 @@ def figures_of(
 
 def compare(case: Case) -> dict[str, Any]:
     """Fit one method to one scene and measure its entropy: a task for `sweep`."""
-    scene, truth = scoring._prepared(**case.asked["scene"])
+    scene, truth = scoring.prepared(case)
     found = method(case.asked["method"]["key"]).fit(scene.observation, scene.seed)
     proba = np.asarray(found.predict_proba(truth.grid.points()), dtype=np.float64)
     # Where a wholly hidden object is, no column is right.
@@ -153,7 +154,7 @@ def run(
     for kind in kinds:
         source(kind, data)
     cases = [
-        Case(one.name, {**one.asked, "scores": _VERSION})
+        replace(one, asked={**one.asked, "scores": _VERSION})
         for seed in range(first_seed, first_seed + scenes)
         for kind in kinds
         for one in scoring.cases(kind, [seed], METHODS, data)

@@ -117,21 +117,41 @@ def source(kind: str, data: Path | None = None) -> Source:
     if kind == "analytic":
         return AnalyticSource()
     if kind == "ycb":
-        return FileSource(_meshes_in(_ycb_folder() if data is None else data), true_size=True)
+        return FileSource(meshes_in(_ycb_folder() if data is None else data), true_size=True)
     if kind in _RANDOM_OBJECTS:
         return FileSource(_random_objects(kind))
     if kind == "folder":
         if data is None:
             raise ConfigError("the source 'folder' needs the folder: give data")
-        return FileSource(_meshes_in(data))
+        return FileSource(meshes_in(data))
     raise ConfigError(f"source {kind!r} is unknown; valid: {', '.join(KINDS)}")
+
+
+def chosen_folder(kind: str, data: Path | None = None) -> Path | None:
+    """Return the folder of meshes, absolute, that somebody chose for a set.
+
+    None where there is no choice (sets that take no folder) or none was made: the YCB meshes
+    are at their usual place beside the checkout. Takes what `source` takes.
+    """
+    if kind not in ("ycb", "folder"):
+        return None
+    named = os.environ.get(YCB_VARIABLE) if kind == "ycb" and data is None else data
+    if not named:
+        return None
+    folder = Path(named).resolve()
+    return None if kind == "ycb" and folder == _beside().resolve() else folder
+
+
+def _beside() -> Path:
+    """Where the YCB meshes are, unless somebody says otherwise."""
+    return Path(__file__).resolve().parents[4] / "shared" / "data" / "ycb"
 
 
 def _ycb_folder() -> Path:
     named = os.environ.get(YCB_VARIABLE)
     if named:
         return Path(named)
-    beside = Path(__file__).resolve().parents[4] / "shared" / "data" / "ycb"
+    beside = _beside()
     if not beside.is_dir():
         raise ConfigError(
             f"the YCB meshes are not at {beside}; set {YCB_VARIABLE} to their folder, or give data"
@@ -139,7 +159,8 @@ def _ycb_folder() -> Path:
     return beside
 
 
-def _meshes_in(folder: Path) -> tuple[Path, ...]:
+def meshes_in(folder: Path) -> tuple[Path, ...]:
+    """Return every mesh in a folder and those below, sorted; ConfigError if there is none."""
     if not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder; give one that holds meshes")
     found = sorted(p for p in folder.rglob("*") if p.suffix.lower() in MESH_SUFFIXES)
