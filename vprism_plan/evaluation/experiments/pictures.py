@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vprism_plan.evaluation.baselines import method
-from vprism_plan.evaluation.experiments.tables import SetResults, TableResults
+from vprism_plan.evaluation.experiments.results import SetResults, TableResults
 from vprism_plan.evaluation.metrics import Reliability
 from vprism_plan.evaluation.scene_truth import OCCLUDED, VISIBLE
 from vprism_plan.viz._figures import PALETTE, new_figure

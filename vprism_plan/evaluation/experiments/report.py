@@ -9,7 +9,7 @@ from vprism_plan._files import write_text
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments.claims import REPORTED, Claim, Verdict, claims_of
 from vprism_plan.evaluation.experiments.intervals import CONFIDENCE, RESAMPLES
-from vprism_plan.evaluation.experiments.tables import SetResults, TableResults, summary
+from vprism_plan.evaluation.experiments.results import SetResults, TableResults, summary
 from vprism_plan.evaluation.scene_truth import CLOUD, REACH, SPACING
 
 SET_NAMES = {

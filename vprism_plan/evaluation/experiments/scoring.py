@@ -4,7 +4,7 @@
 import hashlib
 import subprocess
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from functools import cache, lru_cache
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation import baselines
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments.store import Case
@@ -107,6 +108,28 @@ def cases(
         for scene in [scene_question(kind, seed, data)]
         for key, question in questions
     ]
+
+
+def check_sets(kinds: Sequence[str], scenes: int, data: Path | None) -> None:
+    """Raise ConfigError, before anything runs, if sets of scenes cannot be made."""
+    from vprism_plan.evaluation.generation import source
+
+    if scenes < 1:
+        raise ConfigError(f"scenes is {scenes}; it must be at least 1")
+    if not kinds:
+        raise ConfigError("no set of scenes is named; give at least one")
+    for kind in kinds:
+        source(kind, data)
+
+
+def cases_of_sets(
+    kinds: Sequence[str], seeds: Iterable[int], methods: Sequence[str], data: Path | None
+) -> list[Case]:
+    """Return the cases of several sets.
+
+    Seed by seed, so that a run that is cut short has as many scenes of every set.
+    """
+    return [case for seed in seeds for kind in kinds for case in cases(kind, [seed], methods, data)]
 
 
 def scene_of(case: Case) -> tuple[str, int]:

@@ -8,40 +8,22 @@ share is computed once, and one that is added later makes nothing else run again
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vprism_plan.errors import ConfigError
-from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments import scoring
-from vprism_plan.evaluation.experiments.claims import REPORTED, Verdict, claims_of, decide, gain
-from vprism_plan.evaluation.experiments.intervals import SceneScores, estimate
+from vprism_plan.evaluation.experiments.claims import Verdict, claims_of, decide
+from vprism_plan.evaluation.experiments.intervals import SceneScores
+from vprism_plan.evaluation.experiments.report import write_report
+from vprism_plan.evaluation.experiments.results import SetResults, Table, TableResults, summary
 from vprism_plan.evaluation.experiments.store import Case
 from vprism_plan.evaluation.experiments.sweep import SweepError, sweep
 from vprism_plan.evaluation.reconstruction import ReconstructionScores
 
-
-@dataclass(frozen=True)
-class Table:
-    """A comparison of methods.
-
-    Attributes:
-        key: on the command line and in file names.
-        title: of the report.
-        about: what is compared, in a sentence or two.
-        methods: rows, in order.
-        reference: what the others are held against, scene by scene.
-    """
-
-    key: str
-    title: str
-    about: str
-    methods: tuple[str, ...]
-    reference: str
-
+__all__ = ["TABLES", "SetResults", "Table", "TableResults", "chosen_table", "run", "summary"]
 
 TABLES = {
     table.key: table
@@ -73,51 +55,6 @@ TABLES = {
         ),
     )
 }
-
-
-@dataclass(frozen=True, eq=False)
-class SetResults:
-    """One set of scenes.
-
-    Attributes:
-        kind: which set.
-        seeds: of the scenes, in order.
-        objects: labelled objects of each scene, hidden ones included.
-        scores: of each method, scene by scene.
-        costs: of each method: median processor seconds per fit, microseconds per
-            predicted point.
-        commits: that computed any of it.
-    """
-
-    kind: str
-    seeds: tuple[int, ...]
-    objects: tuple[int, ...]
-    scores: dict[str, SceneScores]
-    costs: dict[str, tuple[float, float]]
-    commits: frozenset[str]
-
-
-@dataclass(frozen=True, eq=False)
-class TableResults:
-    """A table on all its sets.
-
-    Attributes:
-        table: what was compared.
-        methods: rows, in order.
-        seeds: that were asked for, of every set.
-        sets: what was found.
-        command: that reprints it.
-        verdicts: by the text of a claim and the kind of a set.
-        left_out: what failed, in a line each; these scenes count for no method.
-    """
-
-    table: Table
-    methods: tuple[str, ...]
-    seeds: range
-    sets: tuple[SetResults, ...]
-    command: str
-    verdicts: dict[str, dict[str, Verdict]]
-    left_out: tuple[str, ...] = ()
 
 
 def run(
@@ -154,21 +91,11 @@ def run(
         SweepError: some scenes failed. The report is written without them (and names them)
             before this is raised, unless no scene of a set is left.
     """
-    from vprism_plan.evaluation.experiments.report import write_report
-
     table = chosen_table(key)
     chosen = tuple(methods) or table.methods
-    if scenes < 1:
-        raise ConfigError(f"scenes is {scenes}; it must be at least 1")
-    _check_sets(kinds, data)
+    scoring.check_sets(kinds, scenes, data)
     seeds = range(first_seed, first_seed + scenes)
-    # Seed by seed, so that a run that is cut short has as many scenes of every set.
-    cases = [
-        case
-        for seed in seeds
-        for kind in kinds
-        for case in scoring.cases(kind, [seed], chosen, data)
-    ]
+    cases = scoring.cases_of_sets(kinds, seeds, chosen, data)
     failed: SweepError | None = None
     options: dict[str, Any] = {
         "jobs": jobs, "backend": backend, "progress": progress, "group": scoring.scene_of,
@@ -206,16 +133,6 @@ def chosen_table(key: str) -> Table:
     if key not in TABLES:
         raise ConfigError(f"there is no table {key!r}; valid: {', '.join(TABLES)}")
     return TABLES[key]
-
-
-def _check_sets(kinds: Sequence[str], data: Path | None) -> None:
-    """Complain about missing meshes before anything runs."""
-    from vprism_plan.evaluation.generation import source
-
-    if not kinds:
-        raise ConfigError("no set of scenes is named; give at least one")
-    for kind in kinds:
-        source(kind, data)
 
 
 def _collected(kind: str, cases: Sequence[Case], answers: Sequence[dict[str, Any]]) -> SetResults:
@@ -267,64 +184,3 @@ def _verdicts(
         claim.text: {found.kind: decide(claim, found.scores) for found in sets}
         for claim in claims_of(key, methods)
     }
-
-
-def summary(results: TableResults) -> dict[str, Any]:
-    """Return every figure of a table with its interval, ready for JSON."""
-    return {
-        "table": results.table.key,
-        "command": results.command,
-        "seeds": [results.seeds[0], results.seeds[-1]],
-        "left_out": list(results.left_out),
-        "commits": sorted({c for found in results.sets for c in found.commits}),
-        "sets": {found.kind: _set_summary(found, results) for found in results.sets},
-        "claims": [
-            {"claim": text, **{kind: verdict.to_dict() for kind, verdict in verdicts.items()}}
-            for text, verdicts in results.verdicts.items()
-        ],
-    }
-
-
-def _set_summary(found: SetResults, results: TableResults) -> dict[str, Any]:
-    reference = found.scores.get(results.table.reference)
-    rows = {}
-    for key, scores in found.scores.items():
-        n = len(scores)
-        row: dict[str, Any] = {
-            "label": method(key).label,
-            "level": method(key).level,
-            "iou": estimate(scores.iou(), n).to_dict(),
-            "chamfer": estimate(scores.chamfer(), n).to_dict(),
-            "lost": scores.all.lost,
-            "fit_seconds": found.costs[key][0],
-            "predict_microseconds": found.costs[key][1],
-            "brier": {p: estimate(scores.brier(c), n).to_dict() for p, c in REPORTED.items()},
-            "ece": {p: estimate(scores.ece(c), n).to_dict() for p, c in REPORTED.items()},
-            "entropy": {p: estimate(scores.entropy(c), n).to_dict() for p, c in REPORTED.items()},
-            "reliability": [part.to_dict() for part in scores.all.parts],
-            "scenes": [
-                {"seed": seed, "iou": _plain(s.mean_iou), "chamfer": _plain(s.mean_chamfer)}
-                for seed, s in zip(found.seeds, scores.scenes, strict=True)
-            ],
-        }
-        if reference is not None and reference is not scores:
-            row["against_reference"] = {
-                "iou": estimate(gain(scores, reference, "iou"), n).to_dict(),
-                "chamfer_saved": estimate(gain(scores, reference, "chamfer"), n).to_dict(),
-                "brier_occluded": estimate(gain(scores, reference, "brier"), n).to_dict(),
-                "ece_occluded": estimate(gain(scores, reference, "ece"), n).to_dict(),
-            }
-        rows[key] = row
-    some = next(iter(found.scores.values())).all
-    return {
-        "scenes": len(found.seeds),
-        "objects": sum(found.objects),
-        "judged": len(some.objects),
-        "hidden": some.hidden,
-        "points": {p: sum(some.parts[k].n for k in c) for p, c in REPORTED.items()},
-        "methods": rows,
-    }
-
-
-def _plain(value: float) -> float | None:
-    return None if np.isnan(value) else value

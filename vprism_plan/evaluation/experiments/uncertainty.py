@@ -147,17 +147,12 @@ def run(
         SweepError: some scenes failed; all others are kept.
     """
     from vprism_plan.evaluation.experiments import uncertainty_report as report
-    from vprism_plan.evaluation.generation import source
 
-    if scenes < 1 or not kinds:
-        raise ConfigError(f"scenes is {scenes} of sets {list(kinds)}; ask for at least 1 of one")
-    for kind in kinds:
-        source(kind, data)
+    scoring.check_sets(kinds, scenes, data)
+    seeds = range(first_seed, first_seed + scenes)
     cases = [
         replace(one, asked={**one.asked, "scores": _VERSION})
-        for seed in range(first_seed, first_seed + scenes)
-        for kind in kinds
-        for one in scoring.cases(kind, [seed], METHODS, data)
+        for one in scoring.cases_of_sets(kinds, seeds, METHODS, data)
     ]
     answers = sweep(
         compare, cases, store, jobs=jobs, backend=backend, group=scoring.scene_of, cluster=cluster
@@ -167,7 +162,7 @@ def run(
     figures = {
         "command": command,
         "commits": sorted({str(answer["commit"]) for answer in answers}),
-        "seeds": [first_seed, first_seed + scenes - 1],
+        "seeds": [seeds[0], seeds[-1]],
         "sets": {kind: _set_figures(kind, cases, answers) for kind in kinds},
         "real": _real_figures(frames, fits),
     }
