@@ -112,6 +112,21 @@ def test_a_batch_is_its_trajectories(costs, colliding, name):
     assert cost(colliding[:0]).shape == (0,)
 
 
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+@pytest.mark.parametrize(
+    "make", [ClearanceCost, SelfCollisionCost, OccupancyCost, EntropyCost, RiskCost]
+)
+def test_no_trajectories_cost_nothing_with_edges_divided_by_their_length(
+    arm_checker, make, backend
+):
+    cost = make(arm_checker, backend=backend)
+    for shape in ((0, 3, 7), (0, 1, 7), (2, 0, 3, 7)):
+        q = torch.zeros(shape, dtype=torch.float64, requires_grad=True)
+        value = cost(q)
+        assert value.shape == shape[:-2]
+        assert torch.autograd.grad(value.sum(), q)[0].shape == shape
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("name", MAKERS)
 def test_other_dtypes(costs, colliding, name, dtype):

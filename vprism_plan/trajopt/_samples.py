@@ -147,7 +147,8 @@ def _parts(
         return torch.zeros(delta.shape[:2], dtype=torch.int64, device=q.device)
     arrays = robot.arrays
     with torch.no_grad():
-        centers = centers_of(q.reshape(-1, q.shape[-1])).reshape(*q.shape[:2], -1, 3)
+        centers = centers_of(q.reshape(-1, q.shape[-1]))
+    centers = centers.reshape(*q.shape[:2], *centers.shape[1:])
     way = centers.diff(dim=1).square().sum(dim=-1).amax(dim=-1).sqrt()
     turning = torch.zeros(q.shape[-1], dtype=torch.bool, device=q.device)
     turning[torch.as_tensor(arrays.q_index[arrays.kind == 1], device=q.device)] = True
