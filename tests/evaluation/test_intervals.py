@@ -150,3 +150,33 @@ def test_claims_name_only_methods_that_ran():
     found = claims.claims_of("baselines", ("voxel", "sgd", "vprism-paper"))
     assert all(better == "vprism-paper" for claim in found for better, _ in claim.pairs)
     assert {worse for claim in found for _, worse in claim.pairs} == {"voxel", "sgd"}
+
+
+def test_the_pair_that_gains_least_in_the_mean_spoke_for_all(three):
+    """A pair of a larger but less sure gain hid behind one of a small and sure gain."""
+
+    def shifted(shifts):
+        return SceneScores(
+            [
+                made_up(np.random.default_rng([7, n]), shift, objects=4)
+                for n, shift in enumerate(shifts)
+            ]
+        )
+
+    spread = 0.15 * np.repeat([1.0, -1.0], 15)
+    scores = {
+        "best": shifted(np.full(30, 0.2)),
+        "near": shifted(np.full(30, 0.17)),  # by 0.03 in every scene
+        "far": shifted(0.2 - 0.04 - spread),  # by 0.04 in the mean, by chance in each scene
+    }
+    sure, unsure = ("best", "near"), ("best", "far")
+    each = [decide(Claim("t", (pair,), "iou"), scores) for pair in (sure, unsure)]
+    assert [one.answer for one in each] == ["yes", "yes in the mean"]
+    assert each[0].gain.value < each[1].gain.value
+    both = decide(Claim("t", (sure, unsure), "iou"), scores)
+    assert (both.answer, both.pair, both.gain) == ("yes in the mean", unsure, each[1].gain)
+    # One pair to the contrary refutes the claim, whatever gains less in the mean.
+    wild = {**scores, "above": shifted(np.full(30, 0.21)), "all": shifted(0.25 - 2 * spread)}
+    found = decide(Claim("t", (("best", "all"), ("best", "above")), "iou"), wild)
+    assert (found.answer, found.pair) == ("no", ("best", "above"))
+    assert found.gain.value > decide(Claim("t", (("best", "all"),), "iou"), wild).gain.value

@@ -47,9 +47,10 @@ class Verdict:
     """What the numbers say of a claim.
 
     Attributes:
-        answer: "yes" or "no" where the interval decides; "yes in the mean" or "not in the mean"
-            where it holds the claimed gain.
-        gain: of the pair that gains least, with its interval; above 0 is better.
+        answer: "yes" where the whole interval of every pair says so, "no" where that of any
+            pair says the opposite; otherwise "yes in the mean" or "not in the mean".
+        gain: of the pair that decides, with its interval; above 0 is better. Of those that
+            give the answer it is the one whose interval reaches lowest.
         pair: that pair.
     """
 
@@ -85,10 +86,20 @@ def decide(claim: Claim, scores: Mapping[str, SceneScores]) -> Verdict:
     for better, worse in claim.pairs:
         a, b = scores[better], scores[worse]
         found.append(estimate(gain(a, b, claim.metric, claim.part), len(a)))
-    # An undefined gain decides nothing, so it comes first.
-    index = min(range(len(found)), key=lambda i: (found[i].value == found[i].value, found[i].value))
-    least = found[index]
-    return Verdict(_answer(least, claim.least), least, claim.pairs[index])
+    answers = [_answer(one, claim.least) for one in found]
+    answer = min(answers, key=_WORST_FIRST.index)
+    deciding = [i for i, own in enumerate(answers) if own == answer]
+    index = min(deciding, key=lambda i: _lowest(found[i]))
+    return Verdict(answer, found[index], claim.pairs[index])
+
+
+# One pair to the contrary refutes a claim; one that is undefined keeps it from being decided.
+_WORST_FIRST = ("no", "undefined", "not in the mean", "yes in the mean", "yes")
+
+
+def _lowest(found: Estimate) -> float:
+    """Lower end of the interval; of a single scene, the figure itself."""
+    return found.value if math.isnan(found.low) else found.low
 
 
 def _answer(found: Estimate, least: float) -> str:
