@@ -155,6 +155,27 @@ def test_the_report_says_what_the_json_says(stubs, tmp_path):
         assert (files[0].parent / picture).stat().st_size > 5000
 
 
+def test_a_claim_about_every_baseline_said_not_which_rows_it_had(stubs, unpainted, tmp_path):
+    _, files = run(tmp_path)  # of seven rows, three
+    text = files[-1].read_text()
+    assert (
+        "Rows of this table that were not computed: OctoMap; Point estimate (SGD); Sigmoid maps, "
+        'one per object; PointSDF. "Every baseline" below stands for Voxel.\n'
+    ) in text
+    _, files = run(tmp_path, key="presets", methods=("vprism-paper", "vprism"))
+    assert "V-PRISM (ours, fine).\n" in files[-1].read_text()
+    _, files = run(tmp_path, key="sampling", methods=tables.TABLES["sampling"].methods[1:2])
+    assert '"Every' not in files[-1].read_text()
+
+
+def test_objects_that_were_tuned_on_were_called_held_out(stubs, unpainted, tmp_path):
+    _, files = run(tmp_path, kinds=("analytic", "random"), scenes=1)
+    assert (
+        "Our presets were chosen on seeds 0 to 99: `analytic` is held out by scene, not by object; "
+        "the objects of `random` were in no tuning scene."
+    ) in files[-1].read_text()
+
+
 def test_answers_about_changed_scenes_are_not_mixed(stubs, unpainted, tmp_path, monkeypatch):
     run(tmp_path, methods=("voxel",))
     old = generation.generate

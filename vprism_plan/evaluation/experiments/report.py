@@ -2,6 +2,7 @@
 """A table as Markdown, JSON and pictures, written so that it explains itself."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments.claims import REPORTED, Claim, Verdict, claims_of
 from vprism_plan.evaluation.experiments.intervals import CONFIDENCE, RESAMPLES
 from vprism_plan.evaluation.experiments.results import SetResults, TableResults, summary
+from vprism_plan.evaluation.experiments.tuning import LAST_SEED, SETS
 from vprism_plan.evaluation.scene_truth import CLOUD, REACH, SPACING
 
 SET_NAMES = {
@@ -41,12 +43,13 @@ def markdown(results: TableResults, figures: dict[str, Any]) -> str:
     """Return the report in Markdown; `figures` is `summary(results)`."""
     table, seeds = results.table, results.seeds
     lines = [
-        f"# {table.title}", "", table.about, "",
+        f"# {table.title}", "", table.about, "", *_not_computed(results),
         f"{len(seeds)} generated scenes of each set, seeds {seeds[0]} to {seeds[-1]}; 3 to 10 "
         "meshes dropped close together until they rest, one view of 640 x 480 pixels with sensor "
         "noise. Reprint with", "",
         f"    {results.command}", "",
         f"Computed at commit {', '.join(figures['commits'])} (\"+\": with changes since).", "",
+        *_held_out(results),
     ]  # fmt: skip
     if results.left_out:
         lines += ["Left out for every method, since these failed:", ""]
@@ -69,6 +72,36 @@ def markdown(results: TableResults, figures: dict[str, Any]) -> str:
     return "\n".join([*lines, *_explanation()])
 
 
+def _held_out(results: TableResults) -> list[str]:
+    """What of these sets our presets were not tuned on: scenes, or objects as well."""
+    by_scene = [f.kind for f in results.sets if f.kind in SETS]
+    by_object = [f.kind for f in results.sets if f.kind == "random"]
+    words = [f"`{kind}` is held out by scene, not by object" for kind in by_scene]
+    words += [f"the objects of `{kind}` were in no tuning scene" for kind in by_object]
+    if not words:
+        return []
+    return [f"Our presets were chosen on seeds 0 to {LAST_SEED}: {'; '.join(words)}.", ""]
+
+
+def _not_computed(results: TableResults) -> list[str]:
+    """Which rows of the table are left out, and what "every" in a claim then stands for."""
+    missing = [key for key in results.table.methods if key not in results.methods]
+    if not missing:
+        return []
+    text = f"Rows of this table that were not computed: {_names(missing)}."
+    claims = claims_of(results.table.key, results.methods)
+    for phrase in ("every continuous baseline", "every baseline"):
+        pairs = [pair for claim in claims if phrase in claim.text for pair in claim.pairs]
+        if pairs:
+            covered = list(dict.fromkeys(other for _, other in pairs))
+            text += f' "{phrase.capitalize()}" below stands for {_names(covered)}.'
+    return [text, ""]
+
+
+def _names(keys: Sequence[str]) -> str:
+    return "; ".join(method(key).label for key in keys)
+
+
 def _claims(results: TableResults) -> list[str]:
     """Which statements hold on which set."""
     if not results.verdicts:
@@ -82,9 +115,11 @@ def _claims(results: TableResults) -> list[str]:
     lines += [
         "",
         "In brackets: the gain and its 95 % interval over scenes, above 0 is better; for Chamfer "
-        "the share that is saved, on the objects that both methods reconstruct. Where several "
-        "methods are compared it is the comparison that gains least, and its methods are named. "
-        '"yes" and "no": the whole interval says so. "in the mean": only the mean does.',
+        "the share that is saved, on the objects that both methods reconstruct. "
+        '"yes": the whole interval says so, in every comparison where there are several. "no": '
+        'that of one comparison says the opposite. "in the mean": only the means do. Of several '
+        "comparisons that give the answer it is the one whose interval reaches lowest, and its "
+        "methods are named.",
         "",
     ]
     return lines
