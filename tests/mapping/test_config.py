@@ -25,6 +25,19 @@ def test_paper_holds_table_three():
     assert paper.weight_variance == 1e4
 
 
+def test_the_paper_follows_no_default():
+    """Answers of the paper's preset are kept without its settings: no default may change them."""
+    given = []
+
+    class Recorder(MapConfig):
+        def __init__(self, **settings):
+            given.append(settings)
+
+    Recorder.paper()
+    assert list(given[0]) == [field.name for field in dataclasses.fields(MapConfig)]
+    assert MapConfig.paper() == MapConfig(**given[0])
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

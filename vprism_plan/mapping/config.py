@@ -201,9 +201,12 @@ class MapConfig:
         included), the hinges' extent (0.15 m around each box centre), the stratum
         (0.1 m). Prior means are 0, so a flat posterior says P(occupied) = 1 - 1/K.
         """
+        # Every field by name: another default is not another paper.
         return cls(
             gamma=1000.0,
+            kernel_cutoff=1e-5,
             hinge_spacing=0.05,
+            hinge_shift=(0.0, 0.0, 0.0),
             hinge_radius=0.15,
             hinge_margin=0.0,
             hinge_depth=None,
@@ -211,6 +214,7 @@ class MapConfig:
             box_trim=0.0,
             stray_share=0.0,
             surface_hinges=32,
+            max_hinges=6000,
             iterations=3,
             variational_updates=1,
             relaxation=1.0,
@@ -221,9 +225,14 @@ class MapConfig:
             prior_occupancy=None,
             object_radius=0.25,
             ray_step=0.1,
+            ray_sampling="stratified",
+            below_plane_samples=4000,
+            below_plane_margin=0.0,
             object_resolution=0.01,
             empty_resolution=0.015,
             front_distance=None,
+            front_resolution=0.007,
+            max_points=150_000,
         )
 
     @classmethod
