@@ -201,6 +201,24 @@ def test_a_local_dask_cluster_gives_the_same(tmp_path):
     assert len(asked(trace)) == 6
 
 
+def test_a_damaged_answer_was_computed_anew_in_every_run_by_workers_elsewhere(
+    tmp_path, monkeypatch
+):
+    trace, cases = tmp_path / "trace", tasks.numbered(tmp_path / "trace", 2)
+    run(cases, tmp_path / "store")
+    path = Store(tmp_path / "store", "sweep_tasks.square").path(cases[1])
+    path.write_text("{")
+
+    def elsewhere(task, cases, kept, parent, number):
+        return number, [Store(tmp_path / "there", kept.task).write(c, task(c)) for c in cases]
+
+    monkeypatch.setattr("vprism_plan.evaluation.experiments.sweep._answer_group", elsewhere)
+    for _ in range(2):
+        assert squares(run(cases, tmp_path / "store")) == [0, 1]
+    assert asked(trace) == [0, 1, 1]
+    assert json.loads(path.read_text())["answer"]["square"] == 1
+
+
 @pytest.mark.parametrize("how", [{"backend": "slurm"}, {"jobs": 0}])
 def test_unknown_ways_to_run_are_refused(how, tmp_path):
     with pytest.raises(ConfigError, match=r"slurm|jobs is 0"):

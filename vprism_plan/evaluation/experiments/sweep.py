@@ -110,7 +110,8 @@ def sweep(
                     _log.error("%s failed: %s", outcome.name, outcome.error)
                 else:
                     answers[number] = outcome
-                    if not kept.path(cases[number]).is_file():  # a worker elsewhere wrote it
+                    # A worker elsewhere wrote it there; here is no file, or still a damaged one.
+                    if kept.read(cases[number]) is None:
                         kept.write(cases[number], outcome)
                 advance(outcome)
     if failures:
