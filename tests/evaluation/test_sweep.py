@@ -201,6 +201,15 @@ def test_a_local_dask_cluster_gives_the_same(tmp_path):
     assert len(asked(trace)) == 6
 
 
+def test_a_store_that_cannot_be_written_lost_every_answer(tmp_path):
+    trace = tmp_path / "trace"
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(ConfigError, match=r"below cannot be written \(Not a directory"):
+        run(tasks.numbered(trace, 3), tmp_path / "file" / "below")
+    assert asked(trace) == []
+    assert run([], tmp_path / "file" / "below") == []  # nothing to keep
+
+
 def test_a_damaged_answer_was_computed_anew_in_every_run_by_workers_elsewhere(
     tmp_path, monkeypatch
 ):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command `eval`: one table of results, computed as far as it is missing, and written."""
 
+import json
 import logging
 import math
 import shlex
@@ -21,9 +22,11 @@ def run_eval(command: Eval, console: Console) -> int:
     """Compute and report; exit code 0.
 
     Raises:
-        ConfigError: an option that does not fit the table, or missing data.
+        ConfigError: an option that does not fit the table, missing data, a folder that cannot
+            be written, or a report of more scenes that would be replaced unasked.
         SweepError: some scenes failed; all others are kept.
     """
+    from vprism_plan.evaluation.experiments.store import require_writable
     from vprism_plan.evaluation.generation import SETS
 
     _check(command)
@@ -34,6 +37,9 @@ def run_eval(command: Eval, console: Console) -> int:
     store = base / "build" / "evaluation" if command.store is None else command.store
     results = base / "results" if root is None else root / "docs" / "results"
     output = results if command.output is None else command.output
+    require_writable(output)
+    if command.output is None:
+        _keep_larger(output / f"{command.table}.json", _total(command.table, kinds, scenes))
     with console.stage(command.table), _log_lines():
         payload, lines, files = _TABLES.get(command.table, _reconstruction)(
             command, kinds, scenes, store, output
@@ -59,6 +65,34 @@ def _check(command: Eval) -> None:
         raise ConfigError("--cluster needs --backend dask or ray; loky runs on this machine")
 
 
+def _total(table: str, kinds: tuple[str, ...], scenes: int) -> int:
+    """Return the scenes of all sets together."""
+    return scenes if table == "planning" else scenes * len(kinds)
+
+
+def _keep_larger(file: Path, scenes: int) -> None:
+    """Refuse to replace, where no output is named, the report of more scenes."""
+    if not file.is_file():
+        return
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        there = (
+            sum(found["about"]["kinds"].values())
+            if file.stem == "planning"
+            else sum(own["scenes"] for own in found["sets"].values())
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"{file} is no report of this program ({error!r}); remove it, or name another "
+            "folder by --output"
+        ) from error
+    if scenes < there:
+        raise ConfigError(
+            f"{file} is of {there} scenes and would be replaced by a report of {scenes}; ask for "
+            "as many, or name another folder by --output"
+        )
+
+
 def _checkout() -> Path | None:
     """Return the checkout that this package runs from; None if it is installed elsewhere."""
     root = Path(__file__).resolve().parents[2]
@@ -66,7 +100,7 @@ def _checkout() -> Path | None:
 
 
 def command_line(command: Eval) -> str:
-    """Return the shortest call that gives the same results."""
+    """Return the shortest call that gives the same results; FOLDER stands for a folder."""
     words = ["vprism-plan", "eval", command.table]
     if command.set != "all":
         words += ["--set", command.set]
@@ -77,7 +111,7 @@ def command_line(command: Eval) -> str:
     if command.methods:
         words += ["--methods", *command.methods]
     if command.data is not None:
-        words += ["--data", command.data.name if command.set != "folder" else str(command.data)]
+        words += ["--data", "FOLDER"]  # where it lies says nothing to others
     return shlex.join(words)
 
 

@@ -4,6 +4,7 @@
 import hashlib
 import json
 import logging
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,23 @@ class Case:
     name: str
     asked: dict[str, Any]
     given: dict[str, Any] = field(default_factory=dict)
+
+
+def require_writable(folder: Path) -> None:
+    """Raise ConfigError, hours before the first write would, if a folder cannot be written.
+
+    The folder, or the nearest above it that exists, is tried with a file; nothing remains.
+    """
+    nearest = Path(folder).absolute()
+    try:
+        while not nearest.exists() and nearest != nearest.parent:
+            nearest = nearest.parent
+        with tempfile.TemporaryFile(dir=nearest) as probe:
+            probe.write(b"probe")
+    except OSError as error:
+        raise ConfigError(
+            f"{folder} cannot be written ({error.strerror}: {nearest}); give another folder"
+        ) from error
 
 
 class Store:

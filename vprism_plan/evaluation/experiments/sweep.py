@@ -20,7 +20,7 @@ from typing import Any
 
 from vprism_plan.errors import ConfigError, VPrismError
 from vprism_plan.evaluation.experiments.backends import one_thread, parallel, use_one_thread
-from vprism_plan.evaluation.experiments.store import Case, Store
+from vprism_plan.evaluation.experiments.store import Case, Store, require_writable
 
 __all__ = ["Case", "Failure", "SweepError", "SweepInputError", "sweep"]
 
@@ -83,7 +83,8 @@ def sweep(
         cluster: see `backends.parallel`.
 
     Raises:
-        ConfigError: two cases ask the same, or a question is not JSON.
+        ConfigError: two cases ask the same, a question is not JSON, or something is to be
+            computed and the store cannot be written.
         SweepError: after all others are done: some cases raised.
     """
     if isinstance(task, partial):
@@ -97,6 +98,7 @@ def sweep(
     missing = [i for i, answer in enumerate(answers) if answer is None]
     failures: dict[int, Failure] = {}
     if missing:
+        require_writable(kept.folder)
         if len(missing) < len(cases):
             _log.info("%d of %d answers were stored already", len(cases) - len(missing), len(cases))
         groups: dict[Hashable, list[int]] = {}

@@ -19,7 +19,7 @@ from vprism_plan.evaluation.experiments.claims import Verdict, claims_of, decide
 from vprism_plan.evaluation.experiments.intervals import SceneScores
 from vprism_plan.evaluation.experiments.report import write_report
 from vprism_plan.evaluation.experiments.results import SetResults, Table, TableResults, summary
-from vprism_plan.evaluation.experiments.store import Case
+from vprism_plan.evaluation.experiments.store import Case, require_writable
 from vprism_plan.evaluation.experiments.sweep import SweepError, sweep
 from vprism_plan.evaluation.reconstruction import ReconstructionScores
 
@@ -87,13 +87,15 @@ def run(
         command: that reprints this, for the report.
 
     Raises:
-        ConfigError: unknown table, set or method, no scene, or missing data.
+        ConfigError: unknown table, set or method, no scene, missing data, or a folder that
+            cannot be written.
         SweepError: some scenes failed. The report is written without them (and names them)
             before this is raised, unless no scene of a set is left.
     """
     table = chosen_table(key)
     chosen = tuple(methods) or table.methods
     scoring.check_sets(kinds, scenes, data)
+    require_writable(output)
     seeds = range(first_seed, first_seed + scenes)
     cases = scoring.cases_of_sets(kinds, seeds, chosen, data)
     failed: SweepError | None = None

@@ -19,7 +19,7 @@ from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments import scoring
 from vprism_plan.evaluation.experiments.intervals import estimate
-from vprism_plan.evaluation.experiments.store import Case
+from vprism_plan.evaluation.experiments.store import Case, require_writable
 from vprism_plan.evaluation.experiments.sweep import sweep
 from vprism_plan.evaluation.protocols import Reconstruction
 from vprism_plan.evaluation.reconstruction import class_entropy
@@ -143,12 +143,13 @@ def run(
             ../shared/data/real beside the checkout. Without any they are left out.
 
     Raises:
-        ConfigError: unknown set, no scene, or missing data.
+        ConfigError: unknown set, no scene, missing data, or a folder that cannot be written.
         SweepError: some scenes failed; all others are kept.
     """
     from vprism_plan.evaluation.experiments import uncertainty_report as report
 
     scoring.check_sets(kinds, scenes, data)
+    require_writable(output)
     seeds = range(first_seed, first_seed + scenes)
     cases = [
         replace(one, asked={**one.asked, "scores": _VERSION})
