@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.small_scenes import small_scene
 
+from vprism_plan._threads import worker_count
 from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.experiments import intersections, uncertainty
 from vprism_plan.evaluation.experiments import uncertainty_report as report
@@ -134,6 +135,23 @@ def test_the_report_holds_every_set_and_frame(stubs, tmp_path):
     assert "again" in text
     assert "## analytic: 2 scenes" in text
     assert "| frame0 | stub |" in text
+
+
+def test_frames_and_pictures_were_fitted_with_other_threads_than_answers(
+    stubs, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("VPRISM_PLAN_THREADS", "3")
+    used = []
+    fit = report.method("sgd").fit
+
+    def counted(observation, seed):
+        used.append(worker_count())
+        return fit(observation, seed)
+
+    monkeypatch.setattr(report.method("sgd"), "fit", staticmethod(counted))
+    uncertainty.run(["analytic"], 1, 7, store=tmp_path / "s", output=tmp_path / "o")
+    assert used == [1] * (3 + 2 * 2)  # three methods on one frame, two on two scenes
+    assert worker_count() == 3
 
 
 def test_a_slice_keeps_near_and_far_apart(monkeypatch):

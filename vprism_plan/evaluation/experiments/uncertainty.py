@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.baselines import method
 from vprism_plan.evaluation.experiments import scoring
+from vprism_plan.evaluation.experiments.backends import one_thread
 from vprism_plan.evaluation.experiments.intervals import estimate
 from vprism_plan.evaluation.experiments.store import Case, require_writable
 from vprism_plan.evaluation.experiments.sweep import sweep
@@ -158,16 +159,19 @@ def run(
     answers = sweep(
         compare, cases, store, jobs=jobs, backend=backend, group=scoring.scene_of, cluster=cluster
     )
-    frames = real_observations(real)
-    fits = [{key: method(key).fit(seen, 0) for key in METHODS} for _, seen in frames]
+    with one_thread():  # as the workers that computed the answers
+        frames = real_observations(real)
+        fits = [{key: method(key).fit(seen, 0) for key in METHODS} for _, seen in frames]
+        real_figures = _real_figures(frames, fits)
     figures = {
         "command": command,
         "commits": sorted({str(answer["commit"]) for answer in answers}),
         "seeds": [seeds[0], seeds[-1]],
         "sets": {kind: _set_figures(kind, cases, answers) for kind in kinds},
-        "real": _real_figures(frames, fits),
+        "real": real_figures,
     }
-    return figures, report.write(figures, kinds, first_seed, data, frames, fits, output)
+    with one_thread():
+        return figures, report.write(figures, kinds, first_seed, data, frames, fits, output)
 
 
 def _set_figures(
