@@ -37,7 +37,7 @@ class FirstContact:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RiskEstimate:
     """The joint probability that a path collides, over worlds drawn from the posterior.
 
@@ -70,8 +70,8 @@ class RiskEstimate:
     certain: bool
     spacing: float
     configurations: int
-    trace: Callable[[], tuple[FirstContact, ...]] = field(repr=False, compare=False)
-    volume: Callable[[], dict[str, float]] = field(repr=False, compare=False)
+    trace: Callable[[], tuple[FirstContact, ...]] = field(repr=False)
+    volume: Callable[[], dict[str, float]] = field(repr=False)
 
     @cached_property
     def first_contact(self) -> tuple[FirstContact, ...]:

@@ -17,7 +17,7 @@ Status = Literal[
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Improvement:
     """The best path at some time of a search.
 
@@ -132,7 +132,7 @@ class PlanReport:
     history: tuple[Improvement, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlanResult:
     """The verdict on a planning query.
 

@@ -23,7 +23,7 @@ _SECONDS_TO_FULL_SPEED = 0.5
 _SAME_DIRECTION = 1e-9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
     """A motion over time, as cubic pieces.
 

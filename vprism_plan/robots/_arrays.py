@@ -13,7 +13,7 @@ KIND_REVOLUTE = 1
 KIND_PRISMATIC = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KinematicArrays:
     """A kinematic tree as C-contiguous float64/int64 arrays.
 

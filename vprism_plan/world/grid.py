@@ -19,7 +19,7 @@ _HEIGHT = 1.0  # metres above it, at least
 _MAX_NODES = 60_000_000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grid:
     """Nodes at spacing * (first + (i, j, k)) for 0 <= (i, j, k) < shape.
 
