@@ -10,26 +10,29 @@ from vprism_plan.robots import KinematicArrays
 
 
 def frame_poses(arrays: KinematicArrays, q: np.ndarray) -> np.ndarray:
-    """(F, 4, 4) world poses by products of homogeneous matrices."""
-    poses = np.tile(np.eye(4), (len(arrays.parent), 1, 1))
-    poses[0, :3, :3] = arrays.base_R
-    poses[0, :3, 3] = arrays.base_t
+    """(..., F, 4, 4) world poses of configurations (..., dof) by products of 4x4 matrices."""
+    poses = np.tile(np.eye(4), (*q.shape[:-1], len(arrays.parent), 1, 1))
+    poses[..., 0, :3, :3] = arrays.base_R
+    poses[..., 0, :3, 3] = arrays.base_t
     for f in range(1, len(arrays.parent)):
-        value = arrays.q_mult[f] * q[arrays.q_index[f]] + arrays.q_offset[f]
-        offset, motion = np.eye(4), np.eye(4)
+        value = arrays.q_mult[f] * q[..., arrays.q_index[f]] + arrays.q_offset[f]
+        along = value[..., None] * arrays.axis[f]
+        offset, motion = np.eye(4), np.tile(np.eye(4), (*q.shape[:-1], 1, 1))
         offset[:3, :3], offset[:3, 3] = arrays.R_off[f], arrays.t_off[f]
         if arrays.kind[f] == 1:
-            motion[:3, :3] = Rotation.from_rotvec(value * arrays.axis[f]).as_matrix()
+            turn = Rotation.from_rotvec(along.reshape(-1, 3)).as_matrix()
+            motion[..., :3, :3] = turn.reshape(*along.shape, 3)
         else:
-            motion[:3, 3] = value * arrays.axis[f]
-        poses[f] = poses[arrays.parent[f]] @ offset @ motion
+            motion[..., :3, 3] = along
+        poses[..., f, :, :] = poses[..., arrays.parent[f], :, :] @ offset @ motion
     return poses
 
 
 def sphere_positions(arrays: KinematicArrays, q: np.ndarray) -> np.ndarray:
-    """(S, 3) world sphere centres."""
-    poses = frame_poses(arrays, q)[arrays.sphere_frame]
-    return np.einsum("sij,sj->si", poses[:, :3, :3], arrays.sphere_center) + poses[:, :3, 3]
+    """(..., S, 3) world sphere centres of configurations (..., dof)."""
+    poses = frame_poses(arrays, q)[..., arrays.sphere_frame, :, :]
+    turned = np.einsum("...sij,sj->...si", poses[..., :3, :3], arrays.sphere_center)
+    return turned + poses[..., :3, 3]
 
 
 @dataclass(frozen=True)
@@ -42,11 +45,12 @@ class BallWorld:
     names: tuple[str, ...] = field(default=("object:1",))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Exact signed distance to everything, metres."""
-        gaps = np.linalg.norm(points[:, None] - self.centers, axis=2) - self.radii
-        best = gaps.min(axis=1)
+        """Exact signed distance of points (..., 3) to everything, metres."""
+        gaps = np.linalg.norm(points[..., None, :] - self.centers, axis=-1) - self.radii
+        best = gaps.min(axis=-1)
         if len(self.planes):
-            best = np.minimum(best, (points @ self.planes[:, :3].T - self.planes[:, 3]).min(axis=1))
+            heights = points @ self.planes[:, :3].T - self.planes[:, 3]
+            best = np.minimum(best, heights.min(axis=-1))
         return best
 
     def baked(
@@ -54,15 +58,19 @@ class BallWorld:
     ):
         """What a checker needs: exact distances at the nodes, rounded down to float32."""
         axes = [np.arange(lo, hi, spacing) for lo, hi in zip(lower, upper, strict=True)]
-        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        gaps = np.linalg.norm(nodes[:, None] - self.centers, axis=2) - self.radii
-        shape = tuple(len(axis) for axis in axes)
-        distance = np.nextafter(gaps.min(axis=1).astype(np.float32), np.float32(-np.inf))
+        x, y, z = np.meshgrid(*axes, indexing="ij", sparse=True)
+        gaps = np.stack(
+            [
+                np.sqrt((x - c[0]) ** 2 + (y - c[1]) ** 2 + (z - c[2]) ** 2) - r
+                for c, r in zip(self.centers, self.radii, strict=True)
+            ]
+        )
+        distance = np.nextafter(gaps.min(axis=0).astype(np.float32), np.float32(-np.inf))
         baked = SimpleNamespace(
             origin=np.array(lower, dtype=float),
             spacing=spacing,
-            distance=distance.reshape(shape),
-            source=np.argmin(gaps, axis=1).astype(np.int16).reshape(shape),
+            distance=distance,
+            source=np.argmin(gaps, axis=0).astype(np.int16),
         )
         return SimpleNamespace(
             field=baked,
@@ -75,21 +83,21 @@ class BallWorld:
         )
 
 
-def world_clearance(arrays: KinematicArrays, world: BallWorld, q: np.ndarray) -> float:
-    """Exact distance of the moving links' spheres to the world, metres."""
+def world_clearance(arrays: KinematicArrays, world: BallWorld, q: np.ndarray) -> np.ndarray:
+    """(...) exact distance of the moving links' spheres to the world, metres, at q (..., dof)."""
     moving = ~arrays.link_fixed[arrays.sphere_link]
-    centers = sphere_positions(arrays, q)[moving]
+    centers = sphere_positions(arrays, q)[..., moving, :]
     gaps = world.distance(centers) - arrays.sphere_radius[moving]
-    return float(np.min(gaps, initial=np.inf))
+    return np.min(gaps, axis=-1, initial=np.inf)
 
 
-def self_clearance(arrays: KinematicArrays, q: np.ndarray) -> float:
-    """Smallest gap over all sphere pairs of all link pairs, metres."""
+def self_clearance(arrays: KinematicArrays, q: np.ndarray) -> np.ndarray:
+    """(...) smallest gap over all sphere pairs of all link pairs, metres, at q (..., dof)."""
     centers = sphere_positions(arrays, q)
-    best = np.inf
+    best = np.full(q.shape[:-1], np.inf)
     for a, b in arrays.pairs:
-        for s in np.flatnonzero(arrays.sphere_link == a):
-            for t in np.flatnonzero(arrays.sphere_link == b):
-                gap = np.linalg.norm(centers[s] - centers[t])
-                best = min(best, gap - arrays.sphere_radius[s] - arrays.sphere_radius[t])
+        s, t = (np.flatnonzero(arrays.sphere_link == link) for link in (a, b))
+        gaps = np.linalg.norm(centers[..., s, None, :] - centers[..., None, t, :], axis=-1)
+        gaps = gaps - arrays.sphere_radius[s][:, None] - arrays.sphere_radius[t]
+        best = np.minimum(best, gaps.min(axis=(-2, -1), initial=np.inf))
     return best
