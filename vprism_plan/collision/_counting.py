@@ -8,6 +8,8 @@ from jaxtyping import Float, Int
 
 from vprism_plan._kernels import checking, risk
 from vprism_plan.collision._risk_setting import Setting
+from vprism_plan.collision._travel import AT_MOST
+from vprism_plan.errors import RobotError
 
 _FIRST = np.zeros(1, np.int64)
 
@@ -39,6 +41,11 @@ def count_path(at: Setting, path: Float[np.ndarray, "t dof"]) -> Sweep:
         return count_each(at, path)
     steps = np.empty(len(path) - 1, np.int64)
     n = int(checking.count_steps(path, at.floats, at.ints, at.spacing, steps)) + 1
+    if n > AT_MOST:
+        raise RobotError(
+            f"a path of {len(path)} waypoints needs {n:,} configurations to miss nothing on the "
+            f"way; at most {AT_MOST:,}: ask for parts of it"
+        )
     centers = np.empty((n, 3, len(at.radii)))
     slack = np.empty((n, len(at.radii)))
     checking.place_path(path, steps, at.floats, at.ints, centers, slack)

@@ -4,6 +4,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.collision.protocols import Answers, BakedWorld, NodeField, RuledWorld
 from vprism_plan.collision.reports import Contact, Kind, StateReport
 
@@ -79,6 +80,12 @@ def _limit_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
         if not np.isfinite(q[j]):
             detail = f"joint {name} is {q[j]}; give a finite value"
             found.append(Contact("not_finite", name, "not_finite", np.inf, detail=detail))
+        elif abs(q[j]) > FARTHEST:
+            detail = (
+                f"joint {name} is {q[j]:g}, farther than {FARTHEST:g} from 0; count fewer turns"
+            )
+            excess = float(abs(q[j]) - FARTHEST)
+            found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
         elif not robot.continuous[j] and not robot.lower[j] <= q[j] <= robot.upper[j]:
             excess = float(max(robot.lower[j] - q[j], q[j] - robot.upper[j]))
             detail = (

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from vprism_plan.collision._packing import require_prismatic_limits
 from vprism_plan.collision._path_risk import PathRisk
 from vprism_plan.collision._risk_setting import Setting
+from vprism_plan.collision._travel import refuse_far
 from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.entropy import PathEntropy, path_entropy
 from vprism_plan.collision.margin_reports import SafetyMargins
@@ -87,9 +88,7 @@ class Queries:
                 f"path has shape {array.shape}; {self.robot.name} needs (T, {self._dof}) or "
                 f"({self._dof},): {', '.join(self.robot.joint_names)}"
             )
-        if not np.isfinite(rows).all():
-            row = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
-            raise RobotError(f"waypoint {row} is {rows[row].tolist()}; give finite joint values")
+        refuse_far(rows, "waypoint")
         if self._slides:
             require_prismatic_limits(self.robot, rows)
         risk = self._risk()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.collision._packing import reach_table
 from vprism_plan.collision.protocols import Answers, Numbers, SphereRobot
 from vprism_plan.errors import RobotError
@@ -13,7 +14,7 @@ from vprism_plan.robots import KinematicArrays
 from vprism_plan.robots._arrays import KIND_PRISMATIC
 from vprism_plan.robots._frames import frame_poses
 
-_AT_MOST = 200_000  # configurations of one query
+AT_MOST = 200_000  # configurations of one query
 
 
 @dataclass(frozen=True)
@@ -53,10 +54,10 @@ class Edges:
         """
         reach = np.maximum(self.motion, self.pair_motion)
         steps = np.maximum(1, np.ceil(reach / (2.0 * tolerance) - 1e-9)).astype(np.int64)
-        if steps.sum() > _AT_MOST:
+        if steps.sum() > AT_MOST:
             raise RobotError(
                 f"a path of up to {reach.sum():.3g} m of motion needs {int(steps.sum()):,} "
-                f"configurations at a tolerance of {tolerance:g} m; at most {_AT_MOST:,}: "
+                f"configurations at a tolerance of {tolerance:g} m; at most {AT_MOST:,}: "
                 "give a coarser tolerance or a shorter path"
             )
         edge = np.repeat(np.arange(len(steps)), steps)
@@ -81,16 +82,23 @@ def edges_of(checker: Answers, path: Numbers) -> Edges:
             f"a path has shape {array.shape}; {robot.name} needs (T, {robot.dof}) with T >= 1: "
             f"{', '.join(robot.joint_names)}"
         )
-    if not np.isfinite(array).all():
-        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise RobotError(
-            f"waypoint {row} is {array[row].tolist()}; a path needs finite joint values"
-        )
+    refuse_far(array, "waypoint")
     _refuse_beyond_limits(robot, array)
     delta = np.diff(array, axis=0)
     turns = np.where(robot.continuous, np.round(delta / (2.0 * np.pi)), 0.0)
     delta = delta - 2.0 * np.pi * turns
     return Edges(array, delta, *motion_bounds(robot.arrays, delta))
+
+
+def refuse_far(Q: Float[np.ndarray, "n dof"], what: str) -> None:
+    """Raise RobotError for the first row with a value that is not finite, or far beyond any
+    use: angles lose their last digits there, and motions their bounds."""
+    near = (np.abs(Q) <= FARTHEST).all(axis=1)
+    if not near.all():
+        row = int(np.flatnonzero(~near)[0])
+        raise RobotError(
+            f"{what} {row} is {Q[row].tolist()}; give finite joint values of at most {FARTHEST:g}"
+        )
 
 
 def checked_tolerance(tolerance: float) -> float:

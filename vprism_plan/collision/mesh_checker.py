@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.collision import _fcl
 from vprism_plan.collision._mesh_queries import Queries, contact_rules
 from vprism_plan.collision._mesh_world import MeshWorld
@@ -86,8 +87,8 @@ class MeshChecker:
         rules = contact_rules(robot, world.map.object_ids, allowed_contacts or {})
         self._queries = Queries(world, self.placed, self.surfaces, rules)
         bounded = ~np.asarray(robot.continuous)
-        self._lower = np.where(bounded, robot.lower, -np.inf)
-        self._upper = np.where(bounded, robot.upper, np.inf)
+        self._lower = np.where(bounded, robot.lower, -FARTHEST)
+        self._upper = np.where(bounded, robot.upper, FARTHEST)
 
     @classmethod
     def like(cls, checker: Any, **options: Any) -> "MeshChecker":
@@ -259,8 +260,8 @@ class MeshChecker:
             name = self.robot.joint_names[j]
             excess = float(max(self._lower[j] - q[j], q[j] - self._upper[j]))
             detail = (
-                f"joint {name} is {q[j]:.4f}, outside its limits "
-                f"[{self._lower[j]:.4f}, {self._upper[j]:.4f}]"
+                f"joint {name} is {q[j]:.10g}, outside its limits "
+                f"[{self._lower[j]:.10g}, {self._upper[j]:.10g}]"
             )
             found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
         return found

@@ -22,6 +22,7 @@ from vprism_plan.robots._mesh_files import MeshFile, PackageDirs, find_mesh
 from vprism_plan.robots._model import MOVING_TYPES, Joint, Link, RobotModel
 from vprism_plan.robots._tree import build_tree
 
+_FARTHEST_LIMIT = 1e4  # radians or metres; SDF writes 1e16 for "none"
 _ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
 
 
@@ -216,5 +217,10 @@ def _limits(element: Any, path: Path) -> tuple[float, float, float]:
         raise RobotError(
             f"joint '{name}' in '{path}' has limits [{lower}, {upper}]; "
             "they must be finite with lower <= upper"
+        )
+    if max(abs(lower), abs(upper)) > _FARTHEST_LIMIT:
+        raise RobotError(
+            f"joint '{name}' in '{path}' has limits [{lower:g}, {upper:g}], beyond "
+            f"{_FARTHEST_LIMIT:g}; no search covers that: make it continuous, or state real limits"
         )
     return lower, upper, velocity
