@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 import trimesh
 from oracles.scene_digest import digest
+from PIL import Image
 
 from vprism_plan.errors import ObservationError
 from vprism_plan.evaluation import Camera
-from vprism_plan.evaluation.generation import MeshScene, generate, load_scene
+from vprism_plan.evaluation.generation import MeshObject, MeshScene, generate, load_scene
+from vprism_plan.evaluation.generation.raycasting import observe
+from vprism_plan.evaluation.generation.shapes import file_precision
+from vprism_plan.evaluation.generation.silhouettes import silhouettes
 from vprism_plan.evaluation.scene_io import GROUND_TRUTH
 from vprism_plan.perception import load_observation
+from vprism_plan.perception.camera import invert_transform
 
 
 @pytest.fixture(scope="module", params=[("analytic", True), ("random", False)], ids=str)
@@ -49,9 +54,10 @@ def test_planners_read_the_same_observation_and_no_truth(scene, tmp_path):
     folder = tmp_path / "scene"
     scene.save(folder)
     same_observation(load_observation(folder), scene.observation)
-    for truth in (GROUND_TRUTH, "scene_gt.json"):
+    for truth in (GROUND_TRUTH, "scene_gt.json", "scene_gt_info.json"):
         (folder / truth).unlink()
-    shutil.rmtree(folder / "models")
+    for truth in ("models", "mask"):
+        shutil.rmtree(folder / truth)
     same_observation(load_observation(folder), scene.observation)
 
 
@@ -75,6 +81,76 @@ def test_bop_tools_find_the_models_where_the_camera_sees_them(scene, tmp_path):
         corners = model.vertices[trimesh.convex.ConvexHull(model.vertices).vertices]
         apart = np.linalg.norm(corners[:, None] - corners[None], axis=2).max()
         assert about["diameter"] == pytest.approx(apart, abs=1e-6)
+
+
+def png(path):
+    return np.array(Image.open(path))
+
+
+def test_bop_tools_missed_silhouettes_and_their_figures(scene, tmp_path):
+    """Every figure of scene_gt_info against its definition, from the files."""
+    scene.save(tmp_path)
+    figures = json.loads((tmp_path / "scene_gt_info.json").read_text())["0"]
+    depth = png(tmp_path / "depth" / "000000.png")
+    assert len(figures) == len(scene.objects)
+    for index, (found, mesh) in enumerate(zip(figures, scene.truth_meshes().values(), strict=True)):
+        visible = png(tmp_path / "mask_visib" / f"000000_{index:06d}.png") > 0
+        whole = png(tmp_path / "mask" / f"000000_{index:06d}.png") > 0
+        assert not (visible & ~whole).any()
+        alone = MeshScene((scene.objects[index],), scene.camera, scene.observation)
+        seen = alone.render(scene.camera).labels == 1
+        assert (seen ^ whole).sum() <= 2  # pixels at an edge
+        assert found["px_count_visib"] == visible.sum()
+        assert found["px_count_all"] == whole.sum()  # none of these reaches out of the image
+        assert found["px_count_valid"] == (depth[whole] > 0).sum()
+        assert found["visib_fract"] == visible.sum() / whole.sum()
+        for name, mask in (("bbox_obj", whole), ("bbox_visib", visible)):
+            y, x = np.nonzero(mask)
+            x0, y0, width, height = found[name]
+            assert (x0, y0, x0 + width, y0 + height) == (x.min(), y.min(), x.max(), y.max())
+        pixels = (
+            scene.camera.intrinsics
+            @ (
+                invert_transform(scene.camera.T_world_camera)
+                @ np.column_stack([mesh.vertices, np.ones(len(mesh.vertices))]).T
+            )[:3]
+        )
+        low, high = (pixels[:2] / pixels[2]).min(axis=1), (pixels[:2] / pixels[2]).max(axis=1)
+        x0, y0, width, height = found["bbox_obj"]
+        assert np.abs(low - [x0, y0]).max() < 2.0
+        assert np.abs(high - [x0 + width, y0 + height]).max() < 2.0
+
+
+def test_what_reaches_out_of_the_image_or_is_hidden_counts_as_in_bop():
+    """A box before another, both cut by the image's left side."""
+    near, far = (
+        MeshObject(name, *box_corners(size), at(x, size[2] / 2))
+        for name, size, x in (("near", (0.02, 0.3, 0.2), 0.1), ("far", (0.02, 0.1, 0.1), 0.0))
+    )
+    camera = Camera.look_at(np.array([0.8, 0.0, 0.12]), np.array([0.0, 0.35, 0.1]))
+    masks, (first, second) = silhouettes(
+        MeshScene((near, far), camera, observe([near.mesh(), far.mesh()], (1, 2), camera, None, 0))
+    )
+    assert masks[0].any(axis=0)[0] or masks[0].any(axis=0)[-1]
+    assert first["px_count_all"] > masks[0].sum() == first["px_count_visib"]
+    assert first["bbox_obj"][0] < 0 or sum(first["bbox_obj"][::2]) > camera.width
+    assert first["bbox_visib"][0] >= 0
+    assert sum(first["bbox_visib"][::2]) < camera.width
+    assert first["visib_fract"] == first["px_count_visib"] / first["px_count_all"] < 1.0
+    assert masks[1].any()
+    assert second["px_count_visib"] == second["visib_fract"] == 0
+    assert second["bbox_obj"] == second["bbox_visib"] == [-1, -1, -1, -1]
+
+
+def box_corners(size):
+    mesh = trimesh.creation.box(extents=size)
+    return file_precision(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64)
+
+
+def at(x, z):
+    pose = np.eye(4)
+    pose[:3, 3] = x, 0.0, z
+    return pose
 
 
 def test_a_camera_that_was_not_rounded_reloads_to_the_bit_too(scene, tmp_path):

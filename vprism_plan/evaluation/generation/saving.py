@@ -2,11 +2,14 @@
 """Mesh scenes on disk, in the BOP layout; what is saved loads again bit for bit.
 
     scene_camera.json, depth/, rgb/, mask_visib/   what `load_observation` reads
-    scene_gt.json, models/                         ground truth in BOP's terms
+    scene_gt.json, scene_gt_info.json, mask/,
+    models/                                        ground truth in BOP's terms
     ground_truth.json                              ground truth exactly, for `load_scene`
 
 Millimetres, 16-bit depth in steps of 0.1 mm, image number 0. Models lie inside the
-scene folder, so that a scene is one folder. Nothing that plans reads the last two rows.
+scene folder, so that a scene is one folder, and obj_id counts from 1 in each: several
+scenes in one split of a BOP dataset need their models numbered anew and put beside the
+split. Nothing that plans reads the ground truth.
 """
 
 import json
@@ -23,6 +26,7 @@ from vprism_plan.evaluation.camera import Camera, DepthNoise
 from vprism_plan.evaluation.generation.raycasting import DEPTH_UNIT, metres
 from vprism_plan.evaluation.generation.scene import MeshObject, MeshScene
 from vprism_plan.evaluation.generation.shapes import from_millimetres, to_millimetres
+from vprism_plan.evaluation.generation.silhouettes import silhouettes
 from vprism_plan.evaluation.scene_io import GROUND_TRUTH
 from vprism_plan.perception import load_observation
 from vprism_plan.perception._files import write_atomically
@@ -161,6 +165,10 @@ def _write_truth(scene: MeshScene, folder: Path) -> None:
         models[str(index + 1)] = _model_info(body.vertices / _MILLIMETRE)
         _write_model(body, _model(folder, index))
     _write_json(folder / "scene_gt.json", {"0": poses})
+    masks, figures = silhouettes(scene)
+    for index, mask in enumerate(masks):
+        _write_png(folder / "mask" / f"{_STEM}_{index:06d}.png", 255 * mask.astype(np.uint8))
+    _write_json(folder / "scene_gt_info.json", {"0": figures})
     _write_json(folder / "models" / "models_info.json", models)
     _write_json(folder / GROUND_TRUTH, _description(scene))
 
