@@ -183,7 +183,7 @@ def test_skipping_certain_voxels_errs_as_rarely_as_stated(small):
         assert whole.error_free == whole.error_occupied == 0.0
         assert 0.0 < skipping.error_free <= 0.05
         assert 0.0 <= skipping.error_occupied <= 0.05
-        assert len(skipping._voxels) < len(whole._voxels)
+        assert len(skipping._owners.voxels) < len(whole._owners.voxels)
         free = np.zeros(512, bool)
         occupied = np.zeros(512, bool)
         for part in np.array_split(index, 20):

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int, Int32, UInt8
 from vprism_plan._kernels import risk as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
-from vprism_plan.world._draws import Draws, judge
+from vprism_plan.world._draws import judge
+from vprism_plan.world._owners import Owners
 from vprism_plan.world.distance import checked_points
 
 _MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
@@ -95,15 +96,7 @@ class PosteriorWorlds:
         verdicts = judge(map, self.resolution, tolerance)
         self.error_free = verdicts.error_free
         self.error_occupied = verdicts.error_occupied
-        self._draws = Draws(map, n_worlds, seed)
-        self._first_voxel = verdicts.first
-        self._owner_row = verdicts.row
-        self._voxels = verdicts.voxels
-        n_objects = len(map.object_ids)
-        self._owners = np.empty((n_objects + len(self._voxels), n_worlds), np.uint8)
-        self._owners[:n_objects] = np.arange(1, n_objects + 1, dtype=np.uint8)[:, None]
-        self._by_block, self._block_start = self._sort_into_blocks()
-        self._drawn = np.diff(self._block_start) == 0
+        self._owners = Owners(map, n_worlds, seed, self.resolution, verdicts)
 
         self._reach = reach / self.resolution  # voxels
         self._whole = int(self._reach)
@@ -112,7 +105,7 @@ class PosteriorWorlds:
         self._lut = np.floor(self._scale * np.sqrt(squares)).clip(max=254).astype(np.uint8)
         self._lut[squares > self._reach**2] = kernels.NOTHING
         self._grown = self._grow()
-        self._first_table = self._first_voxel - self._whole
+        self._first_table = self._owners.first - self._whole
         self._rules: list[frozenset[int]] = [frozenset()]
         self._tables = Tables(
             self._grown[None].copy(),
@@ -124,7 +117,7 @@ class PosteriorWorlds:
     def __repr__(self) -> str:
         return (
             f"PosteriorWorlds(n_worlds={self.n_worlds}, seed={self.seed}, "
-            f"drawn_voxels={len(self._voxels)}, nbytes={self.nbytes})"
+            f"drawn_voxels={len(self._owners.voxels)}, nbytes={self.nbytes})"
         )
 
     def redrawn(self, seed: int) -> "PosteriorWorlds":
@@ -135,9 +128,7 @@ class PosteriorWorlds:
         """
         other = copy.copy(self)
         other.seed = seed
-        other._draws = Draws(self.map, self.n_worlds, seed)
-        other._owners = self._owners.copy()
-        other._drawn = np.diff(self._block_start) == 0
+        other._owners = self._owners.redrawn(seed)
         with self._lock:
             other._rules = list(self._rules)
         other._tables = Tables(
@@ -166,15 +157,12 @@ class PosteriorWorlds:
             raise WorldError(
                 f"index has shape {index.shape} and dtype {index.dtype}; it must be (n, 3) integers"
             )
-        local = index - self._first_voxel
-        inside = ((local >= 0) & (local < self._owner_row.shape)).all(axis=1)
-        rows = np.full(len(index), -1, np.int64)
-        rows[inside] = self._owner_row[tuple(local[inside].T)]
+        local = index - self._owners.first
+        rows = self._owners.rows_of(local)
         with self._lock:
-            blocks = np.unique(self._block_of(local[rows >= 0]))
-            self._draw(blocks)
+            self._owners.draw(np.unique(self._owners.block_of(local[rows >= 0])))
         out = np.zeros((len(index), self.n_worlds), np.uint8)
-        out[rows >= 0] = self._owners[rows[rows >= 0]]
+        out[rows >= 0] = self._owners.table[rows[rows >= 0]]
         return out
 
     def touched(
@@ -236,8 +224,8 @@ class PosteriorWorlds:
     def nbytes(self) -> int:
         """Bytes held now, by voxel indices, owners and distances."""
         tables = self._tables
-        parts = (self._owner_row, self._owners, self._grown, self._voxels, self._by_block)
-        return sum(int(p.nbytes) for p in (*parts, tables.distance_row, tables.rows))
+        parts = (self._owners, self._grown, tables.distance_row, tables.rows)
+        return sum(int(p.nbytes) for p in parts)
 
     # --- for the risk of robots ----------------------------------------------------------
     @property
@@ -253,7 +241,7 @@ class PosteriorWorlds:
     @property
     def owner_tables(self) -> tuple[Any, Any, Any]:
         """Rows of the owners per voxel, the owners (S innermost), and the first voxel."""
-        return self._owner_row, self._owners, self._first_voxel
+        return self._owners.row, self._owners.table, self._owners.first
 
     @property
     def scale(self) -> tuple[float, float]:
@@ -313,7 +301,7 @@ class PosteriorWorlds:
         """Mark the voxels within reach of any that a draw may occupy: they need a row."""
         from scipy import ndimage
 
-        possible = np.pad(self._owner_row >= 0, self._whole)
+        possible = np.pad(self._owners.row >= 0, self._whole)
         grown = np.full(possible.shape, kernels.FREE, np.int32)
         if possible.any():
             near = ndimage.distance_transform_edt(~possible) <= self._reach
@@ -323,29 +311,6 @@ class PosteriorWorlds:
     def _blocks_of_table(self) -> tuple[int, int, int]:
         x, y, z = (-(-n // _B) for n in self._grown.shape)
         return x, y, z
-
-    def _block_of(self, local: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-        """Flat index of the drawing block that holds each voxel."""
-        shape = tuple(-(-n // _B) for n in self._owner_row.shape)
-        return np.ravel_multi_index(tuple((local // _B).T), shape).astype(np.int64)
-
-    def _sort_into_blocks(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " b"]]:
-        key = self._block_of(self._voxels)
-        order = np.argsort(key, kind="stable").astype(np.int64)
-        n_blocks = int(np.prod([-(-n // _B) for n in self._owner_row.shape]))
-        return order, np.searchsorted(key[order], np.arange(n_blocks + 1)).astype(np.int64)
-
-    def _draw(self, blocks: Int[np.ndarray, " b"]) -> None:
-        """Fill the owners of all voxels of some drawing blocks."""
-        first_row = len(self.map.object_ids)
-        for block in blocks[~self._drawn[blocks]]:
-            piece = slice(int(self._block_start[block]), int(self._block_start[block + 1]))
-            members = self._by_block[piece]
-            points = self.resolution * (self._voxels[members] + self._first_voxel)
-            found = np.empty((len(members), self.n_worlds), np.uint8)
-            self._draws.owners(points, found)
-            self._owners[first_row + members] = found
-            self._drawn[block] = True
 
     def _bake(self, rule: int, blocks: Int[np.ndarray, "b 3"]) -> None:
         """Fill the distances of some blocks of the table (block coordinates)."""
@@ -365,7 +330,9 @@ class PosteriorWorlds:
                 wanted.append(rows)
             if not todo:
                 return
-            self._draw(self._near_blocks(np.array(todo)))
+            corners = np.array(todo) * _B - self._whole  # in voxels of the owners
+            reached = corners - self._whole, corners + _B - 1 + self._whole
+            self._owners.draw(self._owners.blocks_within(*reached))
             fresh = np.empty((start - len(old.rows), self.n_worlds), np.uint8)
             counts = self.counting()[rule]
 
@@ -374,7 +341,7 @@ class PosteriorWorlds:
                     cx, cy, cz = (int(c) for c in todo[n] * _B - self._whole)
                     shifted = np.where(wanted[n] >= 0, wanted[n] - len(old.rows), -1)
                     kernels.bake_block(
-                        self._owner_row, self._owners, counts, cx, cy, cz,
+                        self._owners.row, self._owners.table, counts, cx, cy, cz,
                         self._whole, self._lut, shifted, fresh,
                     )  # fmt: skip
 
@@ -389,17 +356,6 @@ class PosteriorWorlds:
                 np.concatenate([old.rows, fresh]),
                 np.concatenate([old.lowest, fresh.min(axis=1)]),
             )
-
-    def _near_blocks(self, blocks: Int[np.ndarray, "b 3"]) -> Int[np.ndarray, " n"]:
-        """Drawing blocks within reach of some blocks of the table."""
-        shape = np.array([-(-n // _B) for n in self._owner_row.shape])
-        near = np.zeros(tuple(shape), np.bool_)
-        for block in blocks:
-            corner = block * _B - self._whole  # in voxels of `owner_row`
-            low = np.clip((corner - self._whole) // _B, 0, shape)
-            high = np.clip((corner + _B - 1 + self._whole) // _B + 1, 0, shape)
-            near[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = True
-        return np.flatnonzero(near).astype(np.int64)
 
 
 def _block_slices(block: Int[np.ndarray, " 3"]) -> tuple[slice, slice, slice]:
