@@ -9,8 +9,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vprism_plan.robots._fit_surface import (
+    Surface,
+    halved_triangles,
+    split_triangles,
+    with_hull,
+)
 from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._sphere_fit import Surface, halved_triangles, split_triangles, with_hull
 
 # Where a triangle's edges are shorter than this and it still is in no single sphere, the
 # surface counts as bare, metres.

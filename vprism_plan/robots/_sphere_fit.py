@@ -18,22 +18,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan.errors import RobotError
+from vprism_plan.robots._fit_surface import Surface, with_hull
 from vprism_plan.robots._mesh_spheres import candidate_cells, greedy_cover
 
-# Cells along the edge of a cube as large as a link's box, and along its longest edge.
-_CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
-# Longest edge of the triangles that spheres hold, in cells, and in tolerances if these are
-# smaller: a sphere cannot be finer than what it must hold.
-_EDGE, _FINE, _FINEST = 1.5, 2.0, 0.5
 _MOST, _ARM_SIZED = 12, 0.35
-_NEXT_TO_NONE = 0.15
 _CENTRES = 400
 _ROUNDS = 30
 # Relative and absolute (metres): what rounding may take away from a radius.
@@ -135,136 +130,6 @@ def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray
             break
         count = min(max_spheres, count + max(1, count // 4))
     return _filled_up(surface, spheres)
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Small triangles, and a lattice of signed distances to them.
-
-    Attributes:
-        points: (v, 3) corners, each once.
-        faces: (t, 3) indices into them.
-        lower: outer corner of the lattice's first cell.
-        cell: edge of a cell.
-        filled: cells with surface in them or enclosed by such cells.
-        inner: those without a corner.
-        whole: those that no surface reaches: they lie inside.
-        lattice: signed distance at the cells' centres, to within half a cell.
-    """
-
-    points: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "t 3"]
-    lower: Float[np.ndarray, "3"]
-    cell: float
-    filled: Bool[np.ndarray, "x y z"]
-    inner: Bool[np.ndarray, "x y z"]
-    whole: Bool[np.ndarray, "x y z"]
-    lattice: Float[np.ndarray, "x y z"] = field(repr=False)
-
-    @classmethod
-    def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> Surface:
-        from scipy import ndimage
-        from scipy.spatial import cKDTree
-
-        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-        longest = float((high - low).max())
-        cell = float(np.cbrt((high - low).prod())) / _CELLS
-        cell = min(max(cell, longest / _MOST_CELLS), longest / _FEWEST)
-        edge = min(_EDGE * cell, max(_FINE * tolerance, _FINEST * cell))
-        points, faces = _merged(split_triangles(triangles, edge))
-        # No path from cell to cell passes between corners so near to each other.
-        small = split_triangles(points[faces], 0.8 * cell)
-        dense, _ = _merged(small)
-        lower = low - 1.5 * cell
-        touched = np.zeros(tuple(np.ceil((high - low) / cell + 3.0).astype(np.int64)), dtype=bool)
-        touched[tuple(np.floor((dense - lower) / cell).astype(np.int64).T)] = True
-        filled = np.asarray(ndimage.binary_fill_holes(touched))
-        inner = filled & ~touched
-        # A triangle reaches into no other cells than those of its box's corners.
-        ends = np.floor((np.stack([small.min(axis=1), small.max(axis=1)]) - lower) / cell)
-        for corner in np.ndindex(2, 2, 2):
-            touched[tuple(ends[corner, :, [0, 1, 2]].astype(np.int64))] = True
-        whole = filled & ~touched
-        middles = lower + cell * (np.argwhere(np.ones_like(filled)) + 0.5)
-        distance = np.asarray(cKDTree(dense).query(middles)[0]).reshape(filled.shape)
-        lattice = np.where(inner, -distance, distance)
-        return cls(points, faces, lower, cell, filled, inner, whole, lattice)
-
-    def reach(self, centres: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c t"]:
-        """Distance from each centre to the farthest corner of each triangle."""
-        from scipy.spatial.distance import cdist
-
-        away = cdist(centres, self.points)
-        return np.asarray(
-            np.maximum(
-                np.maximum(away[:, self.faces[:, 0]], away[:, self.faces[:, 1]]),
-                away[:, self.faces[:, 2]],
-            )
-        )
-
-    def signed(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Signed distance, interpolated between cells; negative inside."""
-        from scipy.ndimage import map_coordinates
-
-        at = (x - self.lower) / self.cell - 0.5
-        return np.asarray(map_coordinates(self.lattice, at.T, order=1, mode="nearest"))
-
-
-def with_hull(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "t 3 3"]:
-    """A surface, and its convex hull if it is a shell whose openings a fill runs out of.
-
-    Published meshes are often shells with holes, their faces turned either way: nothing says
-    what is inside. Where next to none of what the hull holds is enclosed, the link counts as
-    solid up to its hull: all of that is held, and none of it counts as standing out.
-    """
-    import trimesh
-    from scipy.spatial import ConvexHull, QhullError
-
-    if trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=True).is_watertight:
-        return triangles
-    points = triangles.reshape(-1, 3)
-    try:
-        hull = ConvexHull(points)
-    except QhullError:  # flat: nothing is inside
-        return triangles
-    surface = Surface.of(triangles, math.inf)
-    if surface.inner.sum() * surface.cell**3 > _NEXT_TO_NONE * hull.volume:
-        return triangles
-    return np.concatenate([triangles, points[hull.simplices]])
-
-
-def _merged(
-    triangles: Float[np.ndarray, "t 3 3"],
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
-    """Corners, each once, and the triangles' indices into them."""
-    flat = triangles.reshape(-1, 3)
-    # As bytes, which sort faster than rows; 0.0 + x turns -0.0 into 0.0.
-    keys = np.ascontiguousarray(0.0 + flat).view(np.dtype((np.void, 24))).ravel()
-    _, which, faces = np.unique(keys, return_index=True, return_inverse=True)
-    return flat[which], faces.reshape(-1, 3)
-
-
-def split_triangles(
-    triangles: Float[np.ndarray, "f 3 3"], longest: float
-) -> Float[np.ndarray, "t 3 3"]:
-    """The same surface in triangles with no edge longer than `longest`, metres."""
-    done = []
-    while len(triangles):
-        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        small = edges.max(axis=1) <= longest
-        done.append(triangles[small])
-        triangles = halved_triangles(triangles[~small], edges[~small])
-    return np.concatenate(done)
-
-
-def halved_triangles(
-    triangles: Float[np.ndarray, "f 3 3"], edges: Float[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "t 3 3"]:
-    """Each triangle as two, cut from the middle of its longest edge."""
-    rows, start = np.arange(len(triangles)), edges.argmax(axis=1)
-    a, b, c = (triangles[rows, (start + k) % 3] for k in range(3))
-    middle = 0.5 * (a + b)
-    return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
 
 
 def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> list[int]:
