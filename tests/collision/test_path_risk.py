@@ -94,8 +94,8 @@ def random_case(seed, world, **changes):
     checker = CollisionChecker(world, as_robot(arrays), config(**changes))
     # Near the objects, and short: the oracles take milliseconds per sphere and sample.
     around = [random_q(rng, arrays) for _ in range(40)]
-    low = [sphere_positions(arrays, q)[:, 2].min() for q in around]
-    path = [around[int(np.argmin(np.abs(np.array(low) - 0.05)))]]
+    low = sphere_positions(arrays, np.array(around))[..., 2].min(axis=1)
+    path = [around[int(np.argmin(np.abs(low - 0.05)))]]
     for _ in range(2):
         path.append(path[-1] + rng.uniform(0.005, 0.03) * (random_q(rng, arrays) - path[-1]))
     return rng, arrays, checker, np.array(path)
@@ -124,7 +124,7 @@ def oracle_counts(checker, drawn, path, allowed=None):
     rows = [path[0]]
     for (qa, qb), n in zip(pairwise(path), steps, strict=True):
         rows += [interpolate(checker.robot, qa, qb, t / n) for t in range(1, n + 1)]
-    centers = np.array([sphere_positions(arrays, q) for q in rows])
+    centers = sphere_positions(arrays, np.array(rows))
     # The kernel's slack is proven to cover the gaps by a test of its own.
     sweep = swept(checker, path)
     assert len(rows) == len(sweep.centers)
