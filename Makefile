@@ -14,8 +14,12 @@ STAMP := $(VENV)/.installed
 demo: $(STAMP)
 	$(BIN)/vprism-plan demo --output out/demo
 
+# A worker keeps to its half of the tests, and with it to the fixtures it has made, until the
+# other half is left over.
 test: $(STAMP)
-	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --durations=40 -n 2
+	$(BIN)/python tests/compile_kernels.py
+	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --durations=40 -n 2 \
+		--dist worksteal
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
