@@ -90,14 +90,11 @@ def _ours() -> Iterable[Contender]:
             bounds=((mm / 1000.0, None),), resolution=0.005,
         )  # fmt: skip
     steps = tuple((margin, None) for margin in _LADDER)
-    yield Contender(
-        "ours-widest",
-        "ours, widest margin that works",
-        "ours, widest margin that works",
-        "vprism",
-        "free",
-        steps,
-    )
+    for short, words, resolution in (("", "", 0.01), ("dense-", " (5 mm grid)", 0.005)):
+        name = f"ours, widest margin that works{words}"
+        yield Contender(
+            f"ours-{short}widest", name, name, "vprism", bounds=steps, resolution=resolution
+        )
 
 
 _LADDER = (0.02, 0.01, 0.005, 0.0)  # metres
