@@ -80,7 +80,7 @@ def make_setting(
     """
     arrays = robot.arrays
     moving = ~np.asarray(arrays.link_fixed)[arrays.sphere_link]
-    radii = arrays.sphere_radius
+    radii = arrays.sphere_radius.copy()  # kernels get it
     resolution = float(world.field.spacing)
     room = _ROOM if config.max_risk is None else _ROOM + PADDINGS[-1]
     reach = float(np.max(radii[moving], initial=0.0)) + config.margin + room * resolution

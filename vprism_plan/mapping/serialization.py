@@ -143,8 +143,7 @@ def _plane_row(plane: Plane) -> np.ndarray:
 def _plane(row: np.ndarray) -> Plane:
     plane = Plane(row[:3], float(row[3]))
     # The constructor scales to unit length, which may move the last bit of a stored normal.
-    object.__setattr__(plane, "normal", row[:3].copy())
-    object.__setattr__(plane, "offset", float(row[3]))
+    plane.__setstate__({"normal": row[:3].copy(), "offset": float(row[3])})
     return plane
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import ObservationError
 
 
@@ -15,7 +16,7 @@ class Plane:
     """The plane {x : normal . x = offset}; the normal points to the side of the camera.
 
     Attributes:
-        normal: (3,) unit vector.
+        normal: (3,) unit vector, read-only.
         offset: metres along the normal.
 
     Raises:
@@ -39,6 +40,11 @@ class Plane:
             raise ObservationError("plane normal is zero; it must point away from the surface")
         object.__setattr__(self, "normal", normal / length)
         object.__setattr__(self, "offset", offset / length)
+        make_read_only(self.__dict__)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        make_read_only(state)
 
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Height of points above the plane, metres; negative on the far side."""

@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from vprism_plan._read_only import make_read_only
 
 KIND_FIXED = 0
 KIND_REVOLUTE = 1
@@ -15,7 +18,7 @@ KIND_PRISMATIC = 2
 
 @dataclass(frozen=True, eq=False)
 class KinematicArrays:
-    """A kinematic tree as C-contiguous float64/int64 arrays.
+    """A kinematic tree as C-contiguous float64/int64 arrays, read-only.
 
     Frame 0 is the robot's base; every other frame belongs to one moving joint,
     parents before children. Fixed joints, and joints locked at a value, are
@@ -80,3 +83,11 @@ class KinematicArrays:
     lower: Float[np.ndarray, "dof"]
     upper: Float[np.ndarray, "dof"]
     continuous: Bool[np.ndarray, "dof"]
+
+    def __post_init__(self) -> None:
+        """Keep users of the robot's limits and radii from changing those of every checker."""
+        make_read_only(self.__dict__)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        make_read_only(state)

@@ -46,7 +46,7 @@ class _Chain:
             raise RobotError(f"q has dtype {dtype}; valid: torch.float32, torch.float64")
 
         def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, device=device).to(
+            return torch.tensor(values, device=device).to(
                 dtype if values.dtype.kind == "f" else torch.int64
             )
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import _attached, _frames, _padding
 from vprism_plan.robots._arrays import KinematicArrays
@@ -33,6 +34,7 @@ from vprism_plan.robots._setup import rigid_pose
 from vprism_plan.robots._sphere_files import write_spheres
 from vprism_plan.robots._sphere_fit import SphereFit
 from vprism_plan.robots._torch_kinematics import TorchKinematics
+from vprism_plan.robots._values import joint_values
 from vprism_plan.robots.report import RobotReport, robot_report
 
 if TYPE_CHECKING:
@@ -47,7 +49,8 @@ class Robot:
     """A robot read from a URDF; build it with :meth:`from_urdf`.
 
     A configuration ``q`` has one value per name in ``joint_names``: radians for
-    revolute and continuous joints, metres for prismatic ones.
+    revolute and continuous joints, metres for prismatic ones. Its arrays are read-only; copy
+    what is to be changed.
 
     Attributes:
         name: The robot's name.
@@ -105,6 +108,13 @@ class Robot:
     # Link -> metres that the file of its spheres wants it to grow by; in `arrays` already.
     _file_padding: dict[str, float] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        make_read_only(self.__dict__)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        make_read_only(state)
 
     @classmethod
     def from_urdf(
@@ -262,12 +272,16 @@ class Robot:
         """
         import torch
 
+        if not isinstance(q, torch.Tensor):
+            raise RobotError(
+                f"q is a {type(q).__name__}; give a tensor: torch.as_tensor(q, dtype=torch.float64)"
+            )
         if q.ndim == 0 or q.shape[-1] != self.dof:
             raise RobotError(f"q has shape {tuple(q.shape)}; expected {self._expected('(..., ')}")
         if not bool(torch.isfinite(q.detach()).all()):
             raise RobotError("q holds NaN or infinite values; give finite joint values")
         local = self._torch.sphere_centers(q.reshape(-1, self.dof))
-        base = torch.as_tensor(self.base_pose, dtype=q.dtype, device=q.device)
+        base = torch.tensor(self.base_pose, dtype=q.dtype, device=q.device)
         world = local @ base[:3, :3].T + base[:3, 3]
         return world.reshape(*q.shape[:-1], *world.shape[1:])
 
@@ -303,13 +317,7 @@ class Robot:
         Raises:
             RobotError: The length is wrong or a value is not a finite number.
         """
-        try:
-            array = np.array(np.asarray(q), dtype=np.float64, order="C")
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise RobotError(
-                f"a configuration of {self.name} cannot be read from {type(q).__name__}: {error}; "
-                f"expected {self._expected('(')}"
-            ) from error
+        array = joint_values(q, self, "a configuration")
         if array.shape != (self.dof,):
             raise RobotError(
                 f"a configuration of {self.name} has shape {array.shape}; "

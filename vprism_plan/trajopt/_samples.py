@@ -93,7 +93,7 @@ def path_steps(
     require_dof(robot, q)
     if not bool(robot.continuous.any()):
         return delta
-    free = torch.as_tensor(robot.continuous, device=q.device)
+    free = torch.tensor(robot.continuous, device=q.device)
     turns = torch.where(free, (delta.detach() / (2.0 * math.pi)).round(), 0.0)
     return delta - 2.0 * math.pi * turns
 

@@ -76,7 +76,7 @@ class ClearanceCost(TrajectoryCost):
         self._scene = scene_of(world, robot)
         self.robot = self._scene.robot
         self._checked = (self._scene.sphere_rules >= 0).nonzero()[0]
-        self._planes = self._scene.world.planes
+        self._planes = self._scene.world.planes.copy()
         self._field = union_field(self._scene.fields(), self._planes)
         self._radii = self._scene.radii
         self._grown = grown(self._radii, self._field.spacing)

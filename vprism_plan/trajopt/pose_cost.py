@@ -87,7 +87,7 @@ class PoseCost(TrajectoryCost):
     ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3 3"]]:
         """Return position (metres) and rotation of the link in the world."""
         points = self._points.sphere_centers(q.reshape(-1, q.shape[-1]))
-        base = torch.as_tensor(self.robot.base_pose).to(points)
+        base = torch.tensor(self.robot.base_pose).to(points)
         points = (points @ base[:3, :3].T + base[:3, 3]).reshape(*q.shape[:-1], 4, 3)
         axes = points[..., 1:, :] - points[..., :1, :]
         return points[..., 0, :], axes.transpose(-1, -2)

@@ -127,7 +127,7 @@ class OccupancyCost(_PosteriorCost):
         self._certain: SplineField | None = None
         self._planes = np.empty((0, 4))
         if self._scene.world is not None:
-            self._planes = self._scene.world.planes
+            self._planes = self._scene.world.planes.copy()
             fields = [self._scene.world.certain_field(ids) for ids in self._scene.rules]
             self._certain = union_field(fields, self._planes)
             self._softness = _SOFTNESS * self._certain.spacing

@@ -98,7 +98,7 @@ class RiskCost(TrajectoryCost):
         self._planes = np.empty((0, 4))
         fields: list[Any] = []
         if scene.world is not None:
-            self._planes = scene.world.planes
+            self._planes = scene.world.planes.copy()
             fields = [scene.world.certain_field(ids) for ids in scene.rules]
         reach = float(self._grown.max(initial=0.0)) + self._cut
         self._draws = draw_field(draws, scene.rules, fields, self._planes, reach)

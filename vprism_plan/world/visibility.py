@@ -164,9 +164,10 @@ def classify_cells(
 
         run_chunked(look, blocks, 2)
     if plane is not None:
+        normal = plane.normal.copy()  # its own is read-only, a type of its own to kernels
         run_chunked(
             lambda piece: kernels.clear_below(
-                plane.normal, plane.offset, origin, spacing, status, piece.start, piece.stop
+                normal, plane.offset, origin, spacing, status, piece.start, piece.stop
             ),
             shape[0],
             16,

@@ -63,7 +63,7 @@ class World:
         field: distance to objects, background, occluded or unobserved space (by policy)
             and known geometry.
         planes: (P, 4) float64 rows (nx, ny, nz, offset): obstacles {x : n . x < offset},
-            metres; the support surface first, if the map has one.
+            metres; the support surface first, if the map has one. Read-only.
         plane_names: their names.
         sources: names that `field.source` indexes.
         timings: seconds per step of the bake.
@@ -116,6 +116,14 @@ class World:
         self._draws: dict[tuple[int, int], PosteriorWorlds] = {}
         _log.debug("world baked: %s nodes, %s", self.field.distance.size, self.timings)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Other threads may add to the caches while they are copied."""
+        return {**self.__dict__, "_cache": dict(self._cache), "_draws": dict(self._draws)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.planes.setflags(write=False)
+
     def _timed(self, name: str, step: Any, *args: Any) -> Any:
         start = time.perf_counter()
         result = step(*args)
@@ -133,7 +141,9 @@ class World:
             if isinstance(item, HalfSpace):
                 names.append(f"known:{item.name}")
                 rows.append([*item.normal, item.offset])
-        return tuple(names), np.array(rows, dtype=np.float64).reshape(-1, 4)
+        planes = np.array(rows, dtype=np.float64).reshape(-1, 4)
+        planes.setflags(write=False)
+        return tuple(names), planes
 
     def _mark_unseen(self, occluded: OccludedPolicy) -> Lattice:
         return mark_unseen(
