@@ -24,6 +24,7 @@ from vprism_plan.collision.protocols import BakedWorld, Numbers, RuledWorld, Sph
 from vprism_plan.collision.reports import Contact
 from vprism_plan.collision.risk import RiskEstimate
 from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan.robots._values import joint_values
 
 
 class Queries:
@@ -81,7 +82,7 @@ class Queries:
             RobotError: a wrong shape, a value that is not finite, or a prismatic joint
                 outside its limits (no bound on the motion holds there).
         """
-        array = np.ascontiguousarray(path, dtype=np.float64)
+        array = joint_values(path, self.robot, "a path")
         rows = array[None] if array.ndim == 1 else array
         if rows.ndim != 2 or rows.shape[1] != self._dof or len(rows) == 0:
             raise RobotError(

@@ -13,6 +13,7 @@ from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
 from vprism_plan.robots._arrays import KIND_PRISMATIC
 from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots._values import joint_values
 
 AT_MOST = 200_000  # configurations of one query
 
@@ -76,7 +77,7 @@ def edges_of(checker: Answers, path: Numbers) -> Edges:
             its limits, beyond which its motion has no bound.
     """
     robot = checker.robot
-    array = np.ascontiguousarray(path, dtype=np.float64)
+    array = joint_values(path, robot, "a path")
     if array.ndim != 2 or array.shape[1] != robot.dof or len(array) == 0:
         raise RobotError(
             f"a path has shape {array.shape}; {robot.name} needs (T, {robot.dof}) with T >= 1: "

@@ -4,6 +4,7 @@
 import copy
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,6 +25,7 @@ from vprism_plan.collision.protocols import (
 )
 from vprism_plan.collision.reports import MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan.robots._values import joint_values
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
@@ -94,6 +96,14 @@ class CollisionChecker(Queries):
             if self.config.max_risk < world.config.level:
                 self._fields, self._world = self._within_level_set()
         self._warm_up()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Every copy, in this process or another, has a lock of its own."""
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
 
     def _within_level_set(
         self,
@@ -323,7 +333,7 @@ class CollisionChecker(Queries):
         return world, own
 
     def _configuration(self, q: Numbers) -> Float[np.ndarray, "dof"]:
-        array = np.ascontiguousarray(q, dtype=np.float64)
+        array = joint_values(q, self.robot, "a configuration")
         if array.shape != self._shape:
             raise RobotError(
                 f"configuration has shape {array.shape}; {self.robot.name} needs ({self._dof},): "
@@ -332,7 +342,7 @@ class CollisionChecker(Queries):
         return array
 
     def _configurations(self, Q: Numbers) -> Float[np.ndarray, "n dof"]:
-        array = np.ascontiguousarray(Q, dtype=np.float64)
+        array = joint_values(Q, self.robot, "configurations")
         if array.ndim != 2 or array.shape[1] != self._dof:
             raise RobotError(
                 f"configurations have shape {array.shape}; {self.robot.name} needs "

@@ -14,6 +14,7 @@ from vprism_plan.collision.protocols import Numbers
 from vprism_plan.collision.reports import Contact
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot
+from vprism_plan.robots._values import joint_values
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
 # Grid steps that the field may refuse beyond a surface: its interpolation gives up less than
@@ -65,7 +66,7 @@ def compare(checker: Any, mesh_checker: SurfaceChecker, Q: Numbers) -> Compariso
     Raises:
         RobotError: Q does not have shape (n, dof) or is not finite.
     """
-    rows = np.asarray(Q, dtype=np.float64)
+    rows = joint_values(Q, mesh_checker.robot, "Q")
     if rows.ndim != 2:
         raise RobotError(f"Q has shape {rows.shape}; it must be (n, {mesh_checker.robot.dof})")
     both, neither, found = 0, 0, []

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vprism_plan._numbers import is_number, is_whole
 from vprism_plan.errors import ConfigError
 
 
@@ -48,6 +49,14 @@ class CheckerConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that would make a verdict meaningless."""
+        for name in ("margin", "self_margin", "min_motion", "max_risk", "confidence"):
+            value = getattr(self, name)
+            if not (is_number(value) or (name == "max_risk" and value is None)):
+                raise ConfigError(f"{name} is {value!r}; it must be a number")
+        for name in ("n_worlds", "risk_seed"):
+            value = getattr(self, name)
+            if not is_whole(value):
+                raise ConfigError(f"{name} is {value!r}; it must be a whole number")
         for name in ("margin", "self_margin"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):

@@ -11,6 +11,7 @@ from vprism_plan.collision._travel import edges_of, place_points
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots._values import joint_values
 
 _POINTS = 64  # per sphere and waypoint
 _MAX_CELLS = 200_000_000
@@ -96,7 +97,7 @@ def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> 
     """
     if not (np.isfinite(resolution) and resolution > 0.0):
         raise RobotError(f"resolution is {resolution!r}; it must be positive and finite (metres)")
-    array = np.asarray(q_or_path, dtype=np.float64)
+    array = joint_values(q_or_path, checker.robot, "a path")
     edges = edges_of(checker, array[None] if array.ndim == 1 else array)
     Q, _ = edges.samples(0.25 * resolution)
     mean, most, unsupported, asked = _at_waypoints(checker, edges.path)

@@ -24,6 +24,7 @@ from vprism_plan.collision.path_margins import (
 )
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots._values import joint_values
 
 __all__ = [
     "BodyMargin",
@@ -62,7 +63,7 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
             for the tolerance.
     """
     checked_tolerance(tolerance)
-    array = np.asarray(q_or_path, dtype=np.float64)
+    array = joint_values(q_or_path, checker.robot, "a path")
     if array.ndim == 1:
         checker.clearance(array)  # refuses what is not a configuration
         Q, places, slack = array[None], np.zeros(1), 0.0

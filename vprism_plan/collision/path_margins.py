@@ -10,6 +10,7 @@ from jaxtyping import Float
 from vprism_plan.collision._travel import checked_tolerance, edges_of, motion_bounds
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.collision.reports import StateReport
+from vprism_plan.robots._values import joint_values
 
 _BATCH = 64  # configurations asked at once where clearance is too small to step by
 _HALVINGS = 60
@@ -170,7 +171,7 @@ def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.
         RobotError: a shape is wrong, a value is not finite, or the tolerance is too small.
     """
     checked_tolerance(tolerance)
-    march = _March(checker, np.asarray(q), np.asarray(dq), tolerance)
+    march = _March(checker, q, dq, tolerance)
     safe, refused = march.run()
     reason = None if refused is None else checker.explain(march.at(refused))
     gap = 0.0 if refused is None else (refused - safe) * march.motion
@@ -189,8 +190,8 @@ class _March:
 
     def __init__(self, checker: Any, q: Numbers, dq: Numbers, tolerance: float) -> None:
         self.checker = checker
-        self.q = np.ascontiguousarray(q, dtype=np.float64)
-        self.dq = np.ascontiguousarray(dq, dtype=np.float64)
+        self.q = joint_values(q, checker.robot, "a configuration")
+        self.dq = joint_values(dq, checker.robot, "a motion")
         for array in (self.q, self.dq):  # the checker refuses what has another shape
             checker.clearance(array)
         own, gap = motion_bounds(checker.robot.arrays, self.dq[None])

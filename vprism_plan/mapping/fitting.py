@@ -2,12 +2,14 @@
 """From observations to a map: samples, hinge points, EM (the paper's figure 2)."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Int64
 
+from vprism_plan._numbers import is_whole
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping import negative_sampling as negatives
 from vprism_plan.mapping.config import MapConfig
@@ -61,7 +63,7 @@ def fit_map(
     Raises:
         ObservationError: no labels or no objects (see `segment_tabletop`).
         PlaneNotFoundError: no support plane is known and none can be fitted.
-        MapError: the objects would need too many hinge points.
+        MapError: the objects would need too many hinge points, or the seed is none.
     """
     config = MapConfig() if config is None else config
     problem = learning_problem(observations, config, seed)
@@ -98,7 +100,9 @@ def learning_problem(
 
     Arguments and errors are those of `fit_map`.
     """
-    views = (observations,) if isinstance(observations, Observation) else tuple(observations)
+    views = _views(observations)
+    if not (is_whole(seed) and seed >= 0):
+        raise MapError(f"seed is {seed!r}; it must be a whole number from 0")
     object_ids = _object_ids(views)
     plane = _support_plane(views, seed)
     rng = np.random.default_rng(seed)
@@ -109,6 +113,23 @@ def learning_problem(
         config.cutoff_radius,
     )
     return LearningProblem(views, object_ids, plane, data, space)
+
+
+def _views(observations: Any) -> tuple[Observation, ...]:
+    if isinstance(observations, Observation):
+        return (observations,)
+    if not isinstance(observations, Iterable):
+        raise ObservationError(
+            f"got a {type(observations).__name__}; give one Observation or a list of them"
+        )
+    views = tuple(observations)
+    for number, view in enumerate(views):
+        if not isinstance(view, Observation):
+            raise ObservationError(
+                f"view {number} is a {type(view).__name__}; give Observations (load_observation "
+                "reads one)"
+            )
+    return views
 
 
 def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:

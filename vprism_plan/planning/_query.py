@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.errors import PlanningError
+from vprism_plan._numbers import is_number
+from vprism_plan.errors import PlanningError, RobotError
 from vprism_plan.planning._clock import clock_named
 from vprism_plan.planning._planners import planner_kind
 from vprism_plan.planning._protocol import CheckerLike
@@ -23,6 +24,7 @@ from vprism_plan.planning.goals import (
     solve_region,
 )
 from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
+from vprism_plan.robots._values import joint_values
 
 
 def search_request(
@@ -44,7 +46,7 @@ def search_request(
         )
     if stop == "converged" and kind.optimising and not kind.reports_cost:
         raise PlanningError(f"{planner} does not say what its path costs; use stop='limit'")
-    if not (math.isfinite(time_limit) and time_limit > 0):
+    if not (is_number(time_limit) and math.isfinite(time_limit) and time_limit > 0):
         raise PlanningError(f"time_limit is {time_limit!r} s; it must be finite and more than 0")
     if stop not in ("limit", "first", "converged"):
         raise PlanningError(f"stop is {stop!r}; valid values are 'limit', 'first', 'converged'")
@@ -54,7 +56,7 @@ def search_request(
             f"convergence is {convergence!r}; it must be (tolerance in (0, 1), patience of "
             "at least 1 iteration)"
         )
-    if step is not None and not (math.isfinite(step) and step > 0.0):
+    if step is not None and not (is_number(step) and math.isfinite(step) and step > 0.0):
         raise PlanningError(f"step is {step!r}; it must be finite and more than 0, or None")
     return SearchRequest(
         planner=planner,
@@ -69,7 +71,7 @@ def search_request(
 
 def configuration(q: Any, robot: Any, what: str) -> Float[np.ndarray, " dof"]:
     """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
-    array = np.array(q, dtype=np.float64)
+    array = _numbers(q, robot, what)
     if array.shape != (robot.dof,):
         raise PlanningError(
             f"{what} has shape {array.shape}; it must be ({robot.dof},), one value per joint: "
@@ -78,6 +80,14 @@ def configuration(q: Any, robot: Any, what: str) -> Float[np.ndarray, " dof"]:
     if not np.isfinite(array).all():
         raise PlanningError(f"{what} is {array}; every joint value must be finite")
     return array
+
+
+def _numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
+    """Return a fresh float64 copy, or raise PlanningError naming what cannot be read."""
+    try:
+        return joint_values(values, robot, what)
+    except RobotError as error:
+        raise PlanningError(str(error)) from error
 
 
 def _outside_limits(robot: Any, q: Float[np.ndarray, " dof"]) -> str:
@@ -122,7 +132,7 @@ def valid_goals(
     if isinstance(goal, ReachRegion):
         found = solve_region(robot, goal, start, report.seed, pose_goal)
         return _accepted(checker, found, "region", pose_goal, report)
-    array = np.asarray(goal, dtype=np.float64)
+    array = _numbers(goal, robot, "goal")
     if array.shape == (4, 4) and (robot.dof != 4 or array[3].tolist() == [0.0, 0.0, 0.0, 1.0]):
         found = solve_pose(robot, array, start, report.seed, pose_goal)
         return _accepted(checker, found, "pose", pose_goal, report)

@@ -20,6 +20,7 @@ from ompl import base as ob
 
 from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._spaces import StateReader
+from vprism_plan.robots._values import joint_values
 
 # A continuous joint that moves further than this is checked in pieces, so that "the
 # straight line" and "the shorter way round" are the same motion for every checker.
@@ -191,8 +192,8 @@ def last_valid(
         The furthest certified configuration and its fraction in [0, 1]; (None, 0.0)
         if qa itself is invalid.
     """
-    qa = np.ascontiguousarray(qa, dtype=np.float64)
-    qb = np.ascontiguousarray(qb, dtype=np.float64)
+    qa = joint_values(qa, checker.robot, "qa")
+    qb = joint_values(qb, checker.robot, "qb")
     turns = np.asarray(checker.robot.continuous, dtype=bool)
     if not checker.is_valid(qa):
         return None, 0.0

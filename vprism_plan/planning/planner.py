@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from vprism_plan._numbers import is_number
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._attempt import Begin, Finish, not_found, other_seed, searched
 from vprism_plan.planning._clock import Now, clock_named
@@ -110,9 +111,9 @@ def plan(
     """
     request = search_request(planner, time_limit, seed, stop, convergence, step, clock)
     for name, value in (("interpolate", interpolate), ("clearance_step", clearance_step)):
-        if value is not None and not value > 0.0:
+        if value is not None and not (is_number(value) and value > 0.0):
             raise PlanningError(f"{name} is {value!r}; it must be more than 0")
-    if not simplify_time >= 0.0:
+    if not (is_number(simplify_time) and simplify_time >= 0.0):
         raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
     refuse_unfit(second_opinion, checker)
     q_start = configuration(start, checker.robot, "start")
