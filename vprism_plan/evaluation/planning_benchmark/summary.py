@@ -12,7 +12,7 @@ from jaxtyping import Float
 from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.experiments.intervals import Estimate, Statistic, ratio
 from vprism_plan.evaluation.planning_benchmark.asking import Answer
-from vprism_plan.evaluation.planning_benchmark.contenders import CONTENDERS, Contender
+from vprism_plan.evaluation.planning_benchmark.contenders import CONTENDERS, Contender, full_label
 
 __all__ = ["OURS", "Outcome", "Statement", "outcomes", "statements"]
 
@@ -253,7 +253,8 @@ def successes_at(
 
 
 def statements(found: Sequence[Outcome]) -> list[Statement]:
-    """Compare our curve with meshes at their success, with unknown occupied at its collisions."""
+    """Compare our curve with meshes at their success (with wide steps and with fine ones), and
+    with unknown occupied at its collisions."""
     ours = [outcome for outcome in found if outcome.contender.key.startswith(OURS)]
     groups = {
         "ours": ours,
@@ -263,6 +264,7 @@ def statements(found: Sequence[Outcome]) -> list[Statement]:
     made = []
     for key, asked in (
         ("fcl", "collisions at its success rate"),
+        ("fcl-fine", "collisions at its success rate"),
         ("octomap-occupied", "successes at its collision rate"),
     ):
         for who, own in groups.items():
@@ -296,7 +298,7 @@ def _compare(who: str, ours: Sequence[Outcome], other: Outcome, asked: str) -> S
     a, b, reached = figures(everything)
     return Statement(
         who,
-        other.contender.line if at_success else other.contender.label,
+        other.contender.line if other.contender.key == "fcl" else full_label(other.contender),
         asked,
         a,
         b,
