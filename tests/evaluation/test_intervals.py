@@ -180,3 +180,23 @@ def test_the_pair_that_gains_least_in_the_mean_spoke_for_all(three):
     found = decide(Claim("t", (("best", "all"), ("best", "above")), "iou"), wild)
     assert (found.answer, found.pair) == ("no", ("best", "above"))
     assert found.gain.value > decide(Claim("t", (("best", "all"),), "iou"), wild).gain.value
+
+
+def test_voxels_of_a_scene_passed_for_independent_cases():
+    """Scenes that are right or wrong as a whole: as many cases as scenes, not as voxels."""
+    rng = np.random.default_rng(3)
+    truth = rng.random(40) < 0.3
+    tables = [Reliability.of(np.full(500, 0.25), np.full(500, bool(y))) for y in truth]
+    (naive,) = Reliability.merged(tables).rows()
+    (row,) = intervals.over_scenes(tables)
+    half = 1.96 * math.sqrt(truth.mean() * (1.0 - truth.mean()) / 40)
+    assert naive.high - naive.low < 0.2 * half
+    assert row.observed - row.low == pytest.approx(half, rel=0.25)
+    assert row.high - row.observed == pytest.approx(half, rel=0.25)
+    assert (row.count, row.predicted, row.observed) == (20000, 0.25, truth.mean())
+    # Independent cases, none of which happened: the bootstrap alone would be sure of it.
+    never = [Reliability.of(np.full(5, 0.05), np.zeros(5, bool)) for _ in range(10)]
+    assert intervals.over_scenes(never) == Reliability.merged(never).rows()
+    # A bin that one scene has: many a draw leaves it empty.
+    one = [*never, Reliability.of(np.full(4, 0.95), np.ones(4, bool))]
+    assert intervals.over_scenes(one)[1] == Reliability.merged(one).rows()[1]

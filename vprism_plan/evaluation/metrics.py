@@ -18,7 +18,7 @@ class ReliabilityBin:
 
     `low` and `high` are the Clopper-Pearson interval of `observed` (95 percent). It holds
     for independent cases, such as paths through different scenes; neighbouring voxels are
-    not, and their interval is too narrow.
+    not, and their interval is too narrow (see `experiments.intervals.over_scenes`).
     """
 
     lower: float

@@ -7,13 +7,14 @@ hide one another and are not independent.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.metrics import Reliability, ReliabilityBin
 from vprism_plan.evaluation.reconstruction import ReconstructionScores
 from vprism_plan.evaluation.scene_truth import PARTS
 
@@ -80,6 +81,31 @@ def ratio(top: Float[np.ndarray, " n"], bottom: Float[np.ndarray, " n"]) -> Stat
         return np.divide(over, under, out=np.full(np.shape(over), np.nan), where=under > 0)
 
     return statistic
+
+
+def over_scenes(tables: Sequence[Reliability]) -> tuple[ReliabilityBin, ...]:
+    """Return the bins of all scenes together with intervals that hold for cases that are alike.
+
+    `Reliability.rows` takes every case for an independent one; neighbouring voxels of a scene,
+    or paths through it, are not. Here scenes are drawn again (draws that leave a bin empty say
+    nothing of it), and an interval ends where the farther of the two ends: a bootstrap knows
+    nothing of what no scene shows.
+
+    Args:
+        tables: one per scene, with equal numbers of bins.
+    """
+    counts = np.array([table.counts for table in tables], dtype=float)
+    positives = np.array([table.positives for table in tables], dtype=float)
+    rng = np.random.default_rng([0, 0xB007])
+    drawn = rng.integers(0, len(tables), (RESAMPLES, len(tables)))
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    rows = []
+    for row in Reliability.merged(tables).rows():
+        b = round(row.lower * counts.shape[1])
+        observed = ratio(positives[:, b], counts[:, b])(drawn)
+        low, high = np.nanpercentile(observed, [tail, 100.0 - tail])
+        rows.append(replace(row, low=min(row.low, float(low)), high=max(row.high, float(high))))
+    return tuple(rows)
 
 
 class SceneScores:
