@@ -37,6 +37,7 @@ from vprism_plan.evaluation.baselines.pointsdf.weights import SHIPPED, save_netw
 from vprism_plan.evaluation.protocols import TrueScene
 
 ROOT = Path(__file__).resolve().parent.parent
+VERSION = 1  # of the examples; raised by hand when generator or sampling change their meaning
 FIRST_SEED, HELD_OUT_SEED = 100_000, 190_000
 HELD_OUT_OBJECT = 360  # of random-train; from here on objects are for validation
 SOLID_VIEWS, MESH_VIEWS = 3, 4
@@ -74,20 +75,32 @@ def meshes(seed: int) -> Parts:
     )
 
 
+def settings() -> dict[str, int]:
+    """Return what kept examples depend on besides their seed."""
+    return {
+        "version": VERSION, "solid_views": SOLID_VIEWS, "mesh_views": MESH_VIEWS,
+        "queries": QUERIES, "uniform_queries": UNIFORM_QUERIES,
+        "held_out_object": HELD_OUT_OBJECT, "held_out_seed": HELD_OUT_SEED,
+    }  # fmt: skip
+
+
 def collected(
     name: str, make: Callable[[int], Parts], seeds: Sequence[int], folder: Path
 ) -> tuple[list[Examples], list[Examples]]:
-    """Make the examples of every seed, or read those of an earlier run."""
+    """Make the examples of every seed, or read those of an earlier run with these settings."""
     learn, validate = [], []
     started = time.perf_counter()
     for done, seed in enumerate(seeds, 1):
         marker = folder / f"{name}-{seed}.json"
         files = [folder / f"{name}-{seed}-{use}.npz" for use in ("learn", "validate")]
-        if not marker.is_file():
+        asked = json.dumps({"seed": seed, **settings()}) + "\n"
+        if not marker.is_file() or marker.read_text(encoding="utf-8") != asked:
+            marker.unlink(missing_ok=True)  # half of the new beside it would pass for the old
             for part, file in zip(make(seed), files, strict=True):
+                file.unlink(missing_ok=True)
                 if part is not None:
                     part.save(file)
-            write_text(marker, json.dumps({"seed": seed}) + "\n")
+            write_text(marker, asked)
         for found, file in zip((learn, validate), files, strict=True):
             if file.is_file():
                 found.append(Examples.load(file))
