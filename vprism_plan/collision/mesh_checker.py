@@ -26,6 +26,7 @@ from vprism_plan.collision.protocols import BakedWorld, Numbers
 from vprism_plan.collision.reports import Contact
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import Robot
+from vprism_plan.robots._values import joint_values
 
 _STEP = 0.005  # metres
 _MAX_CONFIGURATIONS = 1_000_000
@@ -87,8 +88,13 @@ class MeshChecker:
         rules = contact_rules(robot, world.map.object_ids, allowed_contacts or {})
         self._queries = Queries(world, self.placed, self.surfaces, rules)
         bounded = ~np.asarray(robot.continuous)
+        self._arguments = world, robot, links, link_meshes, allowed_contacts, resolution
         self._lower = np.where(bounded, robot.lower, -FARTHEST)
         self._upper = np.where(bounded, robot.upper, FARTHEST)
+
+    def __reduce__(self) -> Any:
+        """A copy is made anew: FCL's objects cannot be copied."""
+        return _made, self._arguments
 
     @classmethod
     def like(cls, checker: Any, **options: Any) -> "MeshChecker":
@@ -203,7 +209,7 @@ class MeshChecker:
             RobotError: path does not have shape (T, dof), T >= 1, or is not finite.
             ConfigError: step is out of range.
         """
-        rows = np.asarray(path, dtype=np.float64)
+        rows = joint_values(path, self.robot, "a path")
         if rows.ndim != 2 or len(rows) == 0:
             raise RobotError(
                 f"path has shape {rows.shape}; it must be (T, {self.robot.dof}) with T >= 1"
@@ -265,3 +271,9 @@ class MeshChecker:
             )
             found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
         return found
+
+
+def _made(world: BakedWorld, robot: Robot, *options: Any) -> MeshChecker:
+    """Make a checker of its arguments in order."""
+    names = ("links", "link_meshes", "allowed_contacts", "resolution")
+    return MeshChecker(world, robot, **dict(zip(names, options, strict=True)))

@@ -55,6 +55,12 @@ class Owners:
         other._drawn = np.diff(self._block_start) == 0
         return other
 
+    def snapshot(self) -> "Owners":
+        """Return the same with tables of their own, which `draw` here does not change."""
+        other = copy.copy(self)
+        other.table, other._drawn = self.table.copy(), self._drawn.copy()
+        return other
+
     @property
     def nbytes(self) -> int:
         """Bytes held."""

@@ -114,6 +114,17 @@ class PosteriorWorlds:
         )
         self._lock = threading.RLock()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but the lock; nobody fills the tables of a copy but the copy."""
+        with self._lock:
+            state = {**self.__dict__, "_owners": self._owners.snapshot()}
+        del state["_lock"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._lock = threading.RLock()
+
     def __repr__(self) -> str:
         return (
             f"PosteriorWorlds(n_worlds={self.n_worlds}, seed={self.seed}, "
@@ -136,7 +147,6 @@ class PosteriorWorlds:
             np.empty((0, self.n_worlds), np.uint8),
             np.empty(0, np.uint8),
         )
-        other._lock = threading.RLock()
         return other
 
     # --- what is where ---------------------------------------------------------------
