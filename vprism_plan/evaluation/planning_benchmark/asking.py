@@ -122,7 +122,7 @@ def _bench(kind: str, seed: int, data: str | None) -> Bench:
 def problem_case(case: Case) -> dict[str, Any]:
     """Find the problems of one scene: a task for `sweep`."""
     asked = case.asked
-    truth = _truth(asked["kind"], asked["seed"], asked["data"])
+    truth = _truth(asked["kind"], asked["seed"], case.given.get("data"))
     given = asked["criteria"]
     criteria = Criteria(**{**given, "ends": tuple(given["ends"])})
     problems = find_problems(truth, asked["count"], asked["seed"], criteria)
@@ -137,7 +137,7 @@ def problem_case(case: Case) -> dict[str, Any]:
 def answer_case(case: Case) -> dict[str, Any]:
     """Ask one contender all problems of one scene: a task for `sweep`."""
     asked = case.asked
-    scene = asked["kind"], asked["seed"], asked["data"]
+    scene = asked["kind"], asked["seed"], case.given.get("data")
     truth, bench = _truth(*scene), _bench(*scene)
     contender = Contender.from_dict(asked["contender"])
     checkers, build = bench.checkers(contender)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vprism_plan.errors import ConfigError
+from vprism_plan.evaluation.experiments import scoring
 from vprism_plan.evaluation.experiments.sweep import Case, SweepError, sweep
 from vprism_plan.evaluation.planning_benchmark.asking import (
     Answer,
@@ -91,14 +92,15 @@ def run(
         raise ConfigError(f"scenes is {scenes}, count {count}; both must be at least 1")
     chosen = contenders(checkers)
     about = {
-        "version": VERSION, "kind": kind, "data": None if data is None else str(data),
+        "version": VERSION, "kind": kind, "data": scoring.data_digest(kind, data),
     }  # fmt: skip
+    given = scoring.whereabouts(kind, data)
     options: dict[str, Any] = {
         "jobs": jobs, "backend": backend, "progress": progress, "cluster": cluster
     }  # fmt: skip
     asked = {"count": count, "criteria": (Criteria() if criteria is None else criteria).to_dict()}
     problems, replaced = _problems(
-        {**about, **asked}, scenes, first_seed, Path(store) / "problems", options
+        {**about, **asked}, given, scenes, first_seed, Path(store) / "problems", options
     )
     limits = Limits() if limits is None else limits
     cases = [
@@ -106,6 +108,7 @@ def run(
             f"{contender.key} {kind} {seed}",
             {**about, "seed": seed, "contender": contender.question(),
              "settings": settings(contender), "limits": asdict(limits), "problems": own},
+            given,
         )
         for seed, own in problems.items()
         for contender in chosen
@@ -127,7 +130,12 @@ def run(
 
 
 def _problems(
-    asked: dict[str, Any], scenes: int, first_seed: int, store: Path, options: dict[str, Any]
+    asked: dict[str, Any],
+    given: dict[str, Any],
+    scenes: int,
+    first_seed: int,
+    store: Path,
+    options: dict[str, Any],
 ) -> tuple[dict[int, list[dict[str, Any]]], dict[int, int]]:
     """Return as many scenes' problems as wanted, by seed, and the seeds that offer too few."""
     kind, count = asked["kind"], asked["count"]
@@ -136,7 +144,7 @@ def _problems(
     seed, end = first_seed, first_seed + _SPARE * scenes
     while len(full) < scenes and seed < end:
         seeds = range(seed, min(seed + scenes - len(full), end))
-        cases = [Case(f"problems {kind} {s}", {**asked, "seed": s}) for s in seeds]
+        cases = [Case(f"problems {kind} {s}", {**asked, "seed": s}, given) for s in seeds]
         for s, found in zip(seeds, sweep(problem_case, cases, store, **options), strict=True):
             if len(found["problems"]) < count:
                 short[s] = len(found["problems"])
