@@ -24,6 +24,8 @@ def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]
         RobotError: they are not real numbers, ragged, too large for a float, masked, or a
             tensor that requires a gradient.
     """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values.copy(order="C")
     try:
         array = np.asarray(values)
         if array.dtype.kind == "c":
