@@ -91,7 +91,9 @@ def test_an_optimising_planner_that_may_converge_comes_near_the_shortest_path(pl
 
 
 def test_an_optimising_planner_uses_its_time_and_no_more():
-    result = plan(disk_world.wall_with_gap(), START, GOAL, "RRTstar", time_limit=0.4)
+    result = plan(
+        disk_world.wall_with_gap(), START, GOAL, "RRTstar", time_limit=0.4, clock="process"
+    )
     assert result.solved
     assert 0.39 < result.report.planning_time < 1.0
 

@@ -90,7 +90,7 @@ for name in ("PRM", "PRMstar"):
     refused(planner=name, clock="process")
     # A continuous joint needs no objective in Python.
     turning = disk_world.DiskChecker([(0.0, 0.0)], [0.3], disk_world.robot(2, (0,)))
-    assert plan(turning, [-0.9, 0.0], [0.9, 0.0], name, time_limit=0.5).solved
+    assert plan(turning, [-0.9, 0.0], [0.9, 0.0], name, time_limit=1.5).solved
 """
     )
     assert done.returncode == 0, done.stderr
@@ -132,7 +132,7 @@ def test_aorrtc_is_new_for_every_query():
         PROLOGUE
         + """
 for seed in range(4):
-    assert plan(wall, start, goal, "AORRTC", time_limit=0.2, seed=seed).solved
+    assert plan(wall, start, goal, "AORRTC", time_limit=0.2, seed=seed, clock="process").solved
 """
     )
     assert done.returncode == 0, done.stderr
