@@ -23,9 +23,9 @@ import vprism_plan as vp
 from vprism_plan._files import replacing, write_text
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.collision._travel import sphere_jacobians
+from vprism_plan.evaluation.planning_benchmark.asking import scene_of
 from vprism_plan.evaluation.planning_benchmark.grid_world import benchmark_robot
 from vprism_plan.evaluation.planning_benchmark.problems import tip_sphere
-from vprism_plan.evaluation.planning_benchmark.asking import scene_of
 from vprism_plan.mapping.serialization import load_map
 from vprism_plan.planning import (
     PathCost,

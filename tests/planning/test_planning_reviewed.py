@@ -82,6 +82,7 @@ def test_a_path_that_costs_nothing_is_noted_once():
     result = plan(
         wall, [-0.7, -0.5], [0.7, -0.5], "BITstar", 0.5, simplify=False,
         objective=RiskObjective(kind=lambda Q: np.zeros(len(Q)), length_weight=0.0),
+        clock="process",
     )  # fmt: skip
     assert result.solved
     assert len(result.report.history) <= 2

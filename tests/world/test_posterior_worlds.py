@@ -292,7 +292,7 @@ def test_nbytes_is_about_what_is_held(small):
     before = worlds.nbytes
     worlds.bake()
     tables = worlds.tables
-    expected = tables.rows.size + 8 * tables.distance_row.size + worlds._owners.size
+    expected = tables.rows.size + 8 * tables.distance_row.size + worlds._owners.table.size
     assert before < worlds.nbytes
     assert worlds.nbytes == pytest.approx(expected, rel=0.5)
     assert str(worlds.nbytes) in repr(worlds)
