@@ -109,7 +109,8 @@ CONTENDERS: dict[str, Contender] = {
             bounds=((0.01, None),), meshes=True,
         ),
         Contender(
-            "fcl-fine", "edges every 1 mm", "meshes with FCL", "vprism", meshes=True, step=0.001,
+            "fcl-fine", "meshes with FCL, edges every 1 mm", "meshes with FCL, edges every 1 mm",
+            "vprism", meshes=True, step=0.001,
         ),
         Contender("points", "point cloud", "points", "points"),
         Contender("octomap-free", "OctoMap, unknown free", "octomap-free", "octomap"),

@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLORS = ("#1b6ca8", "#2a9d5c", "#7b4ea3", "#c27c0e", "#0f8b8d", "#5b6b2f", "#8c564b")
+_COLORS = ("#1b6ca8", "#2a9d5c", "#7b4ea3", "#c27c0e", "#0f8b8d", "#5b6b2f", "#8c564b", "#e377c2")
 _OTHERS = {
-    "fcl": ("#b3261e", "s"), "points": ("#6b4c3b", "v"), "octomap-free": ("#d9822b", "^"),
+    "fcl": ("#b3261e", "s"), "fcl-fine": ("#e5736b", "s"), "points": ("#6b4c3b", "v"),
+    "octomap-free": ("#d9822b", "^"),
     "octomap-occupied": ("#444444", "P"), "sgd": ("#c2185b", "D"), "truth": ("#000000", "*"),
 }  # fmt: skip
 # What became of a problem: colour and word, from good to bad.
