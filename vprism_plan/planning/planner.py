@@ -94,7 +94,7 @@ def plan(
         clock: what limits, and all times of the report, are measured by: "wall", or
             "process", the processor time of this process, which makes measurements on a
             busy machine comparable (a search that waits for nothing takes the same; one
-            that waits, as for a slow checker, ends after `_clock.PATIENCE` times the limit).
+            that waits, as for a slow checker, ends by the wall clock after fifty times the limit).
         objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
             objective are accepted; shortening then never raises the cost, and afterwards
             waypoints are moved, within `simplify_time`, where that lowers it. A straight
