@@ -50,6 +50,8 @@ class Map:
     """Settings of the fit: calibrated for planning, or the paper's Table III."""
     seed: int = 0
     """Seed of the sampling."""
+    strict: bool = False
+    """Refuse (exit code 2) what is usable but odd, in place of a warning."""
     json: bool = False
     """Print one JSON object instead of text."""
 
@@ -99,6 +101,8 @@ class Plan:
     """Image of a BOP scene; default the first."""
     seed: int = 0
     """Seed of the fit, of what is chosen, and of the planner."""
+    strict: bool = False
+    """Refuse (exit code 2) what is usable but odd, in place of a warning."""
     json: bool = False
     """Print one JSON object instead of text."""
 
@@ -137,6 +141,8 @@ class Query:
     """What space outside the image counts as."""
     seed: int = 0
     """Seed of the choice of a base, as for `plan`."""
+    strict: bool = False
+    """Refuse (exit code 2) what is usable but odd, in place of a warning."""
     json: bool = False
     """Print one JSON object instead of text."""
 

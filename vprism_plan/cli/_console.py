@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vprism_plan.errors import VPrismError
+
 if TYPE_CHECKING:
     from rich.status import Status
 
@@ -23,10 +25,13 @@ class Console:
         timings: seconds per stage.
         compile_seconds: seconds spent compiling kernels; 0 once they are cached on disk.
         compiled: how many kernels that were.
+        warnings: what is usable but odd about the input; part of every result.
     """
 
-    def __init__(self, *, as_json: bool = False) -> None:
+    def __init__(self, *, as_json: bool = False, strict: bool = False) -> None:
         self.as_json = as_json
+        self.strict = strict
+        self.warnings: list[str] = []
         self.timings: dict[str, float] = {}
         self.compile_seconds = 0.0
         self.compiled = 0
@@ -87,8 +92,20 @@ class Console:
             "(first use; cached now)"
         )
 
+    def warn(self, warnings: Sequence[str]) -> None:
+        """Take note of what is odd; what was noted before is not repeated.
+
+        Raises:
+            VPrismError: there is something, and the command is strict.
+        """
+        self.warnings += [text for text in warnings if text not in self.warnings]
+        if self.strict and self.warnings:
+            raise VPrismError(f"--strict: {'; '.join(self.warnings)}")
+
     def finish(self, payload: dict[str, Any], lines: Sequence[str]) -> None:
-        """Print the result: one JSON object, or lines of text."""
+        """Print the result and the warnings: one JSON object, or lines of text."""
+        payload = {**payload, "warnings": self.warnings}
+        lines = [*(f"warning: {text}" for text in self.warnings), *lines]
         text = dump_json(payload, indent=None) if self.as_json else "\n".join(lines) + "\n"
         sys.stdout.write(text)
         sys.stdout.flush()

@@ -20,7 +20,7 @@ _RUNNERS: dict[type, tuple[str, str]] = {
 
 def run(command: Command) -> int:
     """Run one command; return its exit code."""
-    console = Console(as_json=command.json)
+    console = Console(as_json=command.json, strict=getattr(command, "strict", False))
     if isinstance(command, Demo):
         from vprism_plan.demo import run_demo
 

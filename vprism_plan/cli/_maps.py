@@ -43,7 +43,9 @@ def fit(obs: "Observation", seed: int, console: Console, preset: str = "default"
 
     config = MapConfig.paper() if preset == "paper" else MapConfig()
     with console.stage("fit"):
-        return fit_map(obs, config, seed=seed)
+        m = fit_map(obs, config, seed=seed)
+    console.warn(m.warnings)
+    return m
 
 
 def describe_map(m: "VPrismMap") -> dict[str, Any]:

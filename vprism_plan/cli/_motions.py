@@ -101,7 +101,9 @@ def bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
 
     config = WorldConfig(occluded=command.occluded, unobserved=command.unobserved)
     with console.stage("bake"):
-        return World(m, config)
+        world = World(m, config)
+    console.warn(world.warnings)
+    return world
 
 
 def checks(command: Plan | Query, robot: "Robot") -> "CheckerConfig":

@@ -36,8 +36,9 @@ def explain(checker: Answers, q: Float[np.ndarray, "dof"]) -> StateReport:
     limits = _limit_contacts(checker, q)
     if not np.isfinite(q).all():
         return StateReport(
-            False, tuple(limits), np.nan, np.nan, checker.config.margin, policies=policies
-        )
+            False, tuple(limits), np.nan, np.nan, checker.config.margin, policies=policies,
+            warnings=checker.warnings,
+        )  # fmt: skip
     valid = checker.is_valid(q)
     contacts: list[Contact] = []
     if not valid:
@@ -53,6 +54,7 @@ def explain(checker: Answers, q: Float[np.ndarray, "dof"]) -> StateReport:
         shares=volume_shares(checker, q),
         policies=policies,
         allowed=tuple(_allowed_contacts(checker, q)),
+        warnings=checker.warnings,
     )
 
 

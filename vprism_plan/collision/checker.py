@@ -277,6 +277,12 @@ class CollisionChecker(Queries):
         """
         return _explain.explain(self, self._configuration(q))
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is usable but odd about the world and the robot; every verdict carries it."""
+        found = (*getattr(self.world, "warnings", ()), *getattr(self.robot, "warnings", ()))
+        return tuple(dict.fromkeys(found))
+
     def verdict_field(self, link: int) -> NodeField:
         """Return the distance field that verdicts check a link (index) against."""
         return self._fields[int(self._link_rules[link])]

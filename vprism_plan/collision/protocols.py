@@ -168,6 +168,11 @@ class Answers(Protocol):
     robot: SphereRobot
     config: CheckerConfig
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is odd about the world and the robot."""
+        ...
+
     def is_valid(self, q: Numbers) -> bool:
         """Verdict on a configuration."""
         ...

@@ -110,6 +110,7 @@ class StateReport:
             "unobserved" or "outside" the grid: what nobody has seen.
         policies: What the world does with those spaces ("occupied", "free", "posterior").
         allowed: Contacts that the rules permit: links that touch objects they may touch.
+        warnings: What is usable but odd about the world and the robot, with the remedy.
     """
 
     valid: bool
@@ -120,6 +121,7 @@ class StateReport:
     shares: dict[str, float] = field(default_factory=dict)
     policies: dict[str, str] = field(default_factory=dict)
     allowed: tuple[Contact, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def text(self) -> str:
         """Return the verdict in one line."""
@@ -150,6 +152,7 @@ class StateReport:
             "shares": dict(self.shares),
             "policies": dict(self.policies),
             "allowed": [contact.to_dict() for contact in self.allowed],
+            "warnings": list(self.warnings),
         }
 
 

@@ -24,6 +24,7 @@ from vprism_plan.mapping.subsampling import grid_subsample
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane
+from vprism_plan.perception.sanity import examine
 
 logger = logging.getLogger(__name__)
 
@@ -70,8 +71,9 @@ def fit_map(
     prior = weight_prior(problem.space, config, len(problem.object_ids) + 1)
     posterior = _learn(problem.space, problem.data, prior, config)
     return VPrismMap(
-        config, problem.object_ids, problem.plane, problem.views, problem.space, posterior, seed
-    )
+        config, problem.object_ids, problem.plane, problem.views, problem.space, posterior, seed,
+        problem.warnings,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,7 @@ class LearningProblem:
         plane: support surface, world frame.
         data: labelled points.
         space: hinge points and kernel.
+        warnings: what was odd about the views.
     """
 
     views: tuple[Observation, ...]
@@ -91,6 +94,7 @@ class LearningProblem:
     plane: Plane
     data: TrainingData
     space: FeatureSpace
+    warnings: tuple[str, ...]
 
 
 def learning_problem(
@@ -105,6 +109,7 @@ def learning_problem(
         raise MapError(f"seed is {seed!r}; it must be a whole number from 0")
     object_ids = _object_ids(views)
     plane = _support_plane(views, seed)
+    views, warnings = examine(views, plane)
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
     space = FeatureSpace(
@@ -112,7 +117,7 @@ def learning_problem(
         config.gamma,
         config.cutoff_radius,
     )
-    return LearningProblem(views, object_ids, plane, data, space)
+    return LearningProblem(views, object_ids, plane, data, space, warnings)
 
 
 def _views(observations: Any) -> tuple[Observation, ...]:
@@ -140,6 +145,8 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
         logger.info("new objects in the view: all %d views are fitted together", len(views))
         return fit_map(views, old.config, old.seed)
     config, plane = old.config, old.plane
+    (observation,), found = examine((observation,), plane)
+    views = (*old.views, observation)
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
     candidates = new_hinges(data, seen, views, plane, config, rng)
@@ -154,7 +161,8 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
         data.points, class_of[data.classes], data.lower, data.upper, data.surface, data.surface_ids
     )
     posterior = _learn(space, data, prior, config)
-    return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed)
+    warnings = tuple(dict.fromkeys([*old.warnings, *found]))
+    return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed, warnings)
 
 
 def training_data(

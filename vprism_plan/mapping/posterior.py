@@ -37,6 +37,7 @@ class VPrismMap:
         plane: support surface in the world frame.
         views: every observation that was fitted.
         seed: the seed of the fit.
+        warnings: what was odd about the views: sentences with the remedy.
         posterior: Gaussian posterior of the weights (hinges in `space` order).
         space: sorted hinge points and kernel.
     """
@@ -50,6 +51,7 @@ class VPrismMap:
         space: FeatureSpace,
         posterior: Posterior,
         seed: int,
+        warnings: tuple[str, ...] = (),
     ) -> None:
         self.config = config
         self.object_ids = tuple(object_ids)
@@ -58,6 +60,7 @@ class VPrismMap:
         self.space = space
         self.posterior = posterior
         self.seed = seed
+        self.warnings = tuple(warnings)
 
     def __repr__(self) -> str:
         return (

@@ -56,6 +56,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "object_ids": list(fitted.object_ids),
         "seed": fitted.seed,
         "views": len(fitted.views),
+        "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
     }
     arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
@@ -98,11 +99,14 @@ def load_map(path: str | Path) -> "VPrismMap":
         _check_sizes(path, space, posterior, object_ids)
         views = tuple(_view(tensors, index) for index in range(int(meta["views"])))
         plane = _plane(tensors["plane"])
+        warnings = tuple(str(text) for text in meta.get("warnings", ()))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, VPrismError):
             raise
         raise MapError(f"{path} is a damaged map ({error!r}); fit it again") from error
-    return VPrismMap(config, object_ids, plane, views, space, posterior, int(meta["seed"]))
+    return VPrismMap(
+        config, object_ids, plane, views, space, posterior, int(meta["seed"]), warnings
+    )
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -148,6 +152,6 @@ def _plane(row: np.ndarray) -> Plane:
 
 
 def _view(tensors: dict[str, np.ndarray], index: int) -> Observation:
-    parts = {part: tensors.get(f"view{index}.{part}") for part in _VIEW_PARTS}
+    parts: dict[str, Any] = {part: tensors.get(f"view{index}.{part}") for part in _VIEW_PARTS}
     row = tensors.get(f"view{index}.plane")
     return Observation(**parts, plane=None if row is None else _plane(row))

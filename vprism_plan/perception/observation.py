@@ -32,6 +32,8 @@ class Observation:
         robot_spheres: (S, 4) float64 rows (x, y, z, radius), metres, *camera* frame: balls
             that held the robot when the image was taken (`ignore_robot` sets them); None =
             nobody said where it was. Pixels that see it are background whatever `labels` say.
+        warnings: what is usable but odd about this view, one sentence each with its remedy;
+            handed on to the map, the world and every verdict.
 
     Raises:
         ObservationError: what is wrong, what would be valid, and the remedy.
@@ -44,6 +46,7 @@ class Observation:
     color: Any = None
     plane: Any = None
     robot_spheres: Any = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         depth = _validation.check_depth(self.depth)
@@ -61,6 +64,7 @@ class Observation:
             raise ObservationError(f"plane is a {type(self.plane).__name__}; give a Plane or None")
         if self.robot_spheres is not None:
             checked["robot_spheres"] = _validation.check_robot_spheres(self.robot_spheres)
+        checked["warnings"] = tuple(str(text) for text in self.warnings)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.labels is not None and self.robot_spheres is not None:

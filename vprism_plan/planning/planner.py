@@ -122,12 +122,13 @@ def plan(
         planner=planner, seed=request.seed, time_limit=request.time_limit, clock=clock
     )
 
+    warnings = tuple(getattr(checker, "warnings", ()))
     refusal = refuse(checker, q_start, "start", report)
     if refusal is not None:
-        return refusal
+        return replace(refusal, warnings=warnings)
     ends = valid_goals(checker, goal, q_start, pose_goal or PoseGoalConfig(), report)
     if isinstance(ends, PlanResult):
-        return ends
+        return replace(ends, warnings=warnings)
     goals, report = ends
     refuse_deadlock(planner, goals)
     report = replace(
@@ -156,6 +157,7 @@ def plan(
     if result.path is not None:
         found = result.report.path_length if cost is None else cost.path(result.path)
         result = replace(result, report=replace(result.report, cost=found))
+    result = replace(result, warnings=warnings)
     return reviewed(with_allowed_contacts(result, checker), checker, second_opinion, now)
 
 

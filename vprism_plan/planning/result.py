@@ -153,6 +153,7 @@ class PlanResult:
         explanation: the checker's `explain` report for an invalid start or goal, or its
             `check_motion_report` for the first edge that failed verification, None
             otherwise.
+        warnings: what is usable but odd about the world and the robot (`checker.warnings`).
     """
 
     path: np.ndarray | None
@@ -161,6 +162,7 @@ class PlanResult:
     message: str = ""
     approximate_path: np.ndarray | None = None
     explanation: Any = None
+    warnings: tuple[str, ...] = ()
 
     @property
     def solved(self) -> bool:

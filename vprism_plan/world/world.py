@@ -325,6 +325,11 @@ class World:
         entropy = np.asarray(self.map.entropy(flat)).reshape(nx, ny)
         return occupancy, entropy, points
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is usable but odd about what this world was made of."""
+        return tuple(getattr(self.map, "warnings", ()))
+
     @cached_property
     def empty(self) -> bool:
         """Whether nothing but half-spaces is an obstacle."""
