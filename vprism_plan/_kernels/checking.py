@@ -18,7 +18,8 @@ Frame 0 is the base; every other frame moves about or along its own z axis. A li
 rule says which of the fields it is checked against; -1: none (it stands on the world).
 
 world floats `wf` = origin x, y, z, spacing, outside_occupied, n_planes, margin, then
-    four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset).
+    four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset); then, where
+    obstacles lie outside the grid, a coarse grid of those: origin, spacing, sizes, nodes.
 distance fields `D` (rules, nx, ny, nz) float32: lower bounds of the signed distance at nodes.
 block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 x 4 cells.
 """
@@ -151,6 +152,48 @@ def _cell_bound(D, rule, h, cx, cy, cz):
     return cone
 
 
+@njit(cache=True, nogil=True)
+def _beyond_bound(wf, x, y, z):
+    """Lower bound of the distance to the obstacles outside the grid, metres.
+
+    As `_cell_bound`, on the coarse grid behind the planes in wf: origin, spacing, sizes, then
+    its nodes. Beyond that grid nothing was judged: everything is an obstacle.
+    """
+    o = 7 + 4 * int(wf[5])
+    h = wf[o + 3]
+    nx = int(wf[o + 4])
+    ny = int(wf[o + 5])
+    nz = int(wf[o + 6])
+    gx = (x - wf[o]) / h
+    gy = (y - wf[o + 1]) / h
+    gz = (z - wf[o + 2]) / h
+    away = (gx - min(max(gx, 0.0), nx - 1.0)) ** 2 + (gy - min(max(gy, 0.0), ny - 1.0)) ** 2
+    away += (gz - min(max(gz, 0.0), nz - 1.0)) ** 2
+    if away > 0.0:
+        return -h * np.sqrt(away)
+    i0 = min(int(gx), nx - 2)
+    j0 = min(int(gy), ny - 2)
+    k0 = min(int(gz), nz - 2)
+    fx = gx - i0
+    fy = gy - j0
+    fz = gz - k0
+    cone = -_INF
+    square = -(h * h) * (fx * (1.0 - fx) + fy * (1.0 - fy) + fz * (1.0 - fz))
+    for a in range(2):
+        wa = fx if a else 1.0 - fx
+        for b in range(2):
+            wb = wa * (fy if b else 1.0 - fy)
+            row = o + 7 + ((i0 + a) * ny + j0 + b) * nz + k0
+            for c in range(2):
+                d = wf[row + c]
+                cone = max(cone, d - h * np.sqrt((fx - a) ** 2 + (fy - b) ** 2 + (fz - c) ** 2))
+                d = max(d, 0.0)
+                square += wb * (fz if c else 1.0 - fz) * d * d
+    if square > 0.0:
+        cone = max(cone, np.sqrt(square))
+    return cone
+
+
 @njit(cache=True, nogil=True, inline="always")
 def field_bound(D, E, wf, rule, x, y, z, enough, deep):
     """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
@@ -162,7 +205,8 @@ def field_bound(D, E, wf, rule, x, y, z, enough, deep):
     and, if `deep`, the best of the cell's eight nodes (`_cell_bound`).
 
     Outside the grid, with c the closest point of the grid box, every obstacle o of the
-    grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex.
+    grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex. What lies
+    beyond the grid has a coarse field of its own (`_beyond_bound`).
     """
     h = wf[3]
     nx = D.shape[1]
@@ -192,6 +236,8 @@ def field_bound(D, E, wf, rule, x, y, z, enough, deep):
             if out2 > 0.0:
                 inside = max(best, 0.0)
                 best = np.sqrt(out2 * h * h + inside * inside)
+                if wf.size > 7 + 4 * int(wf[5]):
+                    best = min(best, _beyond_bound(wf, x, y, z))
             elif wf[4] > 0.0:
                 faces = min(gx, nx - 1.0 - gx, gy, ny - 1.0 - gy)
                 best = min(best, h * min(faces, gz, nz - 1.0 - gz))

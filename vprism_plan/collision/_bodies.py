@@ -121,5 +121,6 @@ def kind_of(name: str) -> Kind:
         "background": "background",
         "occluded": "occluded",
         "unobserved": "unobserved",
+        "support surface": "support",
     }
     return kinds.get(name.split(":", 1)[0], "known")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Turns a refused configuration into named reasons. Not on the fast path."""
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -125,7 +127,7 @@ def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
             kind = _kind_of(body)
             point = centers[s] - radius * normal
             sure = None
-            if kind != "known":
+            if kind not in {"known", "support"}:
                 ball = centers[s] + radius * unit_ball_points()
                 sure = float(np.max(world.map.occupancy(ball)))
             detail = _policy_detail(checker, kind)
@@ -170,6 +172,7 @@ def _kind_of(body: str) -> Kind:
         "background": "background",
         "occluded": "occluded",
         "unobserved": "unobserved",
+        "support surface": "support",
     }
     return kinds.get(head, "known")
 
@@ -178,6 +181,8 @@ def _policy_detail(checker: Answers, kind: Kind) -> str:
     config = checker.world.config
     if kind == "occluded":
         return f"no camera saw this space; policy occluded={config.occluded!r}"
+    if kind == "unobserved" and config.unobserved == "free":
+        return "farther away than was judged; WorldConfig(bounds=...) can take it in"
     if kind == "unobserved":
         return f"no camera looked here; policy unobserved={config.unobserved!r}"
     if kind == "background":
@@ -223,7 +228,15 @@ def nearest_source(
     """
     shape = np.array(field.distance.shape)
     g = (point - field.origin) / field.spacing
-    outside = world.config.unobserved == "occupied" and (np.any(g < 0) or np.any(g > shape - 1))
+    past = bool(np.any(g < 0) or np.any(g > shape - 1))
+    grid: Any = field
+    beyond: Any = getattr(field, "beyond", None)
+    if past and beyond is not None:
+        at = point[None]
+        if float(beyond.lower_bound(at)[0]) <= float(grid.lower_bound(at)[0]):
+            return nearest_source(world, beyond, point)
+    solid = world.config.unobserved == "occupied" or getattr(field, "solid_outside", False)
+    outside = past and solid
     inside = np.clip(g, 0.0, shape - 1.0)
     cell = np.minimum(inside.astype(int), shape - 2)
     corners = cell + np.indices((2, 2, 2)).reshape(3, -1).T

@@ -216,14 +216,20 @@ def pack_world(world: BakedWorld, fields: Sequence[NodeField], margin: float) ->
 
     Args:
         world: Whose half-spaces and policies count.
-        fields: One per contact rule, all on the same nodes.
+        fields: One per contact rule, all on the same nodes and with the same field beyond.
         margin: Metres.
     """
     field = fields[0]
     planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
     outside = 1.0 if world.config.unobserved == "occupied" else 0.0
+    beyond = getattr(field, "beyond", None)
+    far = np.empty(0)
+    if beyond is not None:
+        grid = [*beyond.origin, beyond.spacing, *beyond.distance.shape]
+        far = np.concatenate([grid, beyond.distance.reshape(-1)], dtype=np.float64)
     head = [*np.asarray(field.origin, dtype=np.float64), float(field.spacing), outside]
-    floats = np.array([*head, float(len(planes)), float(margin), *planes.reshape(-1)])
+    head += [float(len(planes)), float(margin), *planes.reshape(-1)]
+    floats = np.concatenate([head, far], dtype=np.float64)
     distance = np.ascontiguousarray([f.distance for f in fields], dtype=np.float32)
     blocks = np.ascontiguousarray([block_bounds(d, float(field.spacing)) for d in distance])
     return PackedWorld(distance=distance, blocks=blocks, floats=floats)

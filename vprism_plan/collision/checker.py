@@ -70,6 +70,8 @@ class CollisionChecker(Queries):
     def __init__(
         self, world: BakedWorld, robot: SphereRobot, config: CheckerConfig | None = None
     ) -> None:
+        if hasattr(world, "for_base") and hasattr(robot, "base_pose"):
+            world = world.for_base(robot.base_pose[:3, 3])
         self.world = world
         self.robot = robot
         self.config = CheckerConfig() if config is None else config
@@ -93,8 +95,7 @@ class CollisionChecker(Queries):
         if self.config.max_risk is not None:
             self._bounded = self._risk()
             self._fields, self._world = self._bounded.fields, self._bounded.packed
-            if self.config.max_risk < world.config.level:
-                self._fields, self._world = self._within_level_set()
+            self._fields, self._world = self._within_what_was_seen()
         self._warm_up()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -105,17 +106,21 @@ class CollisionChecker(Queries):
         self.__dict__.update(state)
         self._lock = threading.Lock()
 
-    def _within_level_set(
+    def _within_what_was_seen(
         self,
     ) -> tuple[list[NodeField], tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Return what verdicts go by where the bound on risk lies below the level.
+        """Return what verdicts under a bound on risk go by beside the draws.
 
-        Touching a point that is occupied with at least the probability `level` breaks such a
-        bound by itself. The draws are counted voxel by voxel, each as the ball inscribed in
-        it: alone they let a planner shave millimetres off a surface that everybody sees.
+        Touching a point that is occupied with at least the probability `level` breaks a bound
+        below the level by itself. The draws are counted voxel by voxel, each as the ball
+        inscribed in it: alone they let a planner shave millimetres off a surface that everybody
+        sees. Under a bound above the level the seen surfaces alone are obstacles.
         """
-        world = self._ruled_world()
-        fields = [world.certain_field(ids, level_set=True) for ids in self._rules]
+        world, bound = self._ruled_world(), self.config.max_risk
+        within = bound is not None and bound < world.config.level
+        fields = [
+            world.certain_field(ids, level_set=within, seen=not within) for ids in self._rules
+        ]
         baked = pack_world(world, fields, self.config.margin)
         return fields, (baked.distance, baked.blocks, baked.floats)
 

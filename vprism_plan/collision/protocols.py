@@ -91,8 +91,11 @@ class RuledWorld(BakedWorld, Protocol):
         """Distance to one object alone."""
         ...
 
-    def certain_field(self, without: Collection[int] = (), level_set: bool = False) -> NodeField:
-        """Distance to what is an obstacle whatever the posterior says, and to the level set."""
+    def certain_field(
+        self, without: Collection[int] = (), level_set: bool = False, seen: bool = False
+    ) -> NodeField:
+        """Distance to what is an obstacle whatever the posterior says, and to the level set, or
+        to whatever was seen of the objects."""
         ...
 
     def posterior_worlds(self, n_worlds: int, seed: int, reach: float) -> Any:

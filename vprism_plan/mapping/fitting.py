@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Int64
+from jaxtyping import Bool, Float, Int, Int64
 
 from vprism_plan._numbers import is_whole
 from vprism_plan.errors import MapError, ObservationError
@@ -39,6 +39,7 @@ class TrainingData:
         lower, upper: (C, 3) corners of the objects' boxes, m.
         surface: the object points among `points`.
         surface_ids: their labels.
+        sunk: which objects lie lower than the support plane.
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -47,6 +48,7 @@ class TrainingData:
     upper: Float[np.ndarray, "c 3"]
     surface: Float[np.ndarray, "s 3"]
     surface_ids: Int64[np.ndarray, " s"]
+    sunk: Bool[np.ndarray, " c"]
 
 
 def fit_map(
@@ -158,8 +160,9 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     prior = expand_prior(old.space, old.posterior, space, config)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     data = TrainingData(
-        data.points, class_of[data.classes], data.lower, data.upper, data.surface, data.surface_ids
-    )
+        data.points, class_of[data.classes], data.lower, data.upper, data.surface,
+        data.surface_ids, data.sunk,
+    )  # fmt: skip
     posterior = _learn(space, data, prior, config)
     warnings = tuple(dict.fromkeys([*old.warnings, *found]))
     return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed, warnings)
@@ -191,12 +194,14 @@ def training_data(
         if config.front_distance is not None:
             seen = negatives.sample_in_front(cloud[label > 0], origin, config.front_distance)
             front.append(grid_subsample(seen, config.front_resolution))
-    empty.append(
-        negatives.sample_below_plane(
-            plane.normal, plane.offset, centers, config.object_radius,
-            config.below_plane_samples, rng, config.below_plane_margin,
-        )
+    below = negatives.sample_below_plane(
+        plane.normal, plane.offset, centers, config.object_radius,
+        config.below_plane_samples, rng, config.below_plane_margin,
     )  # fmt: skip
+    sunk = negatives.sunk_objects(points, labels, object_ids, plane.normal, plane.offset)
+    # What lies lower than the plane has a hidden side of its own: nobody denies that.
+    room = config.object_radius
+    empty.append(below[negatives.outside_boxes(below, lower[sunk], upper[sunk], room)])
     near = np.concatenate(empty)
     if config.ray_sampling != "whole":
         near = _near_any(near, centers, config.object_radius)
@@ -216,6 +221,7 @@ def training_data(
         upper,
         surface,
         np.asarray(object_ids, np.int64)[index],
+        sunk,
     )
 
 
@@ -255,13 +261,14 @@ def new_hinges(
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "h 3"]:
     """Return lattice and surface hinge points of the training data (m, world)."""
-    lattice = lattice_hinges(data.lower, data.upper, plane.normal, plane.offset, config)
+    lattice = lattice_hinges(data.lower, data.upper, plane.normal, plane.offset, config, data.sunk)
     if config.hinge_reach is not None:
-        lattice = lattice[
-            needed_nodes(
-                lattice, views, plane, data.surface, config.hinge_spacing, config.hinge_reach
-            )
-        ]
+        needed = needed_nodes(
+            lattice, views, plane, data.surface, config.hinge_spacing, config.hinge_reach
+        )
+        lower, upper = data.lower[data.sunk], data.upper[data.sunk]
+        needed |= ~negatives.outside_boxes(lattice, lower, upper, config.hinge_margin)
+        lattice = lattice[needed]
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
     hinges = np.concatenate([lattice, surface])
     _check_hinge_count(len(hinges), config)

@@ -2,7 +2,7 @@
 """Hinge points: a lattice around the objects plus random points of their surfaces."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.config import MapConfig
@@ -14,18 +14,20 @@ def lattice_hinges(
     normal: Float[np.ndarray, " 3"],
     offset: float,
     config: MapConfig,
+    sunk: Bool[np.ndarray, " c"] | None = None,
 ) -> Float[np.ndarray, "h 3"]:
     """Return the lattice nodes (m, world) around the objects' boxes.
 
     Nodes are world multiples of `config.hinge_spacing` plus `config.hinge_shift`, so two
     fits of one scene share them. Kept: within `hinge_radius` of a box centre or
     `hinge_margin` of a box, and at most `hinge_depth` under the plane
-    {normal . x = offset}.
+    {normal . x = offset}, unless the object is `sunk`, lower than that itself.
     """
+    sunk = np.zeros(len(lower), dtype=bool) if sunk is None else sunk
     spacing, shift = config.hinge_spacing, np.asarray(config.hinge_shift)
     centers = 0.5 * (lower + upper)
     found: list[np.ndarray] = []
-    for low, high, center in zip(lower, upper, centers, strict=True):
+    for low, high, center, lies_lower in zip(lower, upper, centers, sunk, strict=True):
         reach_low = np.minimum(low - config.hinge_margin, center - config.hinge_radius)
         reach_high = np.maximum(high + config.hinge_margin, center + config.hinge_radius)
         first = np.ceil((reach_low - shift) / spacing)
@@ -41,7 +43,7 @@ def lattice_hinges(
         beyond = np.maximum(np.maximum(low - nodes, nodes - high), 0.0)
         near = np.linalg.norm(nodes - center, axis=1) <= config.hinge_radius
         near |= (config.hinge_margin > 0) & (np.linalg.norm(beyond, axis=1) <= config.hinge_margin)
-        if config.hinge_depth is not None:
+        if config.hinge_depth is not None and not lies_lower:
             near &= nodes @ normal >= offset - config.hinge_depth
         found.append(index[near])
     index = np.unique(np.concatenate(found), axis=0)

@@ -11,6 +11,7 @@ from vprism_plan.world.known import HalfSpace, Known, KnownMesh, Primitive
 
 OccludedPolicy = Literal["occupied", "posterior", "free"]
 UnobservedPolicy = Literal["free", "occupied"]
+SupportExtent = Literal["auto", "seen", "unbounded"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,12 @@ class WorldConfig:
         unobserved: the same for space outside every image or behind pixels without a
             depth return: "free" (default) or "occupied". Space outside the grid counts
             as unobserved.
+        support: how far the support surface goes on.
+            "unbounded": everything below its plane is an obstacle.
+            "seen": only below the convex hull of what was seen of it and 5 cm around; what
+            else lies lower is judged like all other space.
+            "auto" (default): "seen" for a robot whose base stands more than 5 cm below the
+            plane, which its `CollisionChecker` then says, else "unbounded".
         bounds: (lower, upper) corners of the box that the grid must cover at least; None
             chooses the observed objects' box and room around it. The grid always
             covers the whole level set and all known geometry.
@@ -53,6 +60,7 @@ class WorldConfig:
     level: float = 0.5
     occluded: OccludedPolicy = "occupied"
     unobserved: UnobservedPolicy = "free"
+    support: SupportExtent = "auto"
     bounds: Any = None
     known: tuple[Known, ...] = ()
     min_support: float = 0.5
@@ -69,6 +77,7 @@ class WorldConfig:
         _require_in("lone_share", self.lone_share, 0.0, 0.25, "(a share)")
         _require_choice("occluded", self.occluded, get_args(OccludedPolicy))
         _require_choice("unobserved", self.unobserved, get_args(UnobservedPolicy))
+        _require_choice("support", self.support, get_args(SupportExtent))
         object.__setattr__(self, "bounds", _checked_bounds(self.bounds))
         object.__setattr__(self, "known", _checked_known(self.known))
 

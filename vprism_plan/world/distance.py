@@ -84,8 +84,8 @@ def round_down(values: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*sha
 class DistanceField:
     """Lower bounds of the signed distance to a set of obstacles, at the nodes of a grid.
 
-    All obstacles lie inside the grid's box (if `solid_outside`, everything outside
-    of the box is an obstacle too).
+    All obstacles lie inside the grid's box, or in `beyond`, or else (if `solid_outside`)
+    everything outside of the box is an obstacle too.
 
     Attributes:
         origin: (3,) world position of node (0, 0, 0), metres.
@@ -97,6 +97,8 @@ class DistanceField:
             everywhere if there is none.
         sources: names of the obstacles.
         solid_outside: whether space outside the grid is an obstacle.
+        beyond: a coarser field of the obstacles outside the grid's box, whose bounds the
+            nodes here already hold; None if there are none.
     """
 
     origin: Float[np.ndarray, " 3"]
@@ -105,6 +107,7 @@ class DistanceField:
     source: Int16[np.ndarray, "nx ny nz"]
     sources: tuple[str, ...]
     solid_outside: bool = False
+    beyond: "DistanceField | None" = None
     _tensors: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -139,6 +142,10 @@ class DistanceField:
             len(points),
             1 << 14,
         )
+        if self.beyond is not None:
+            outside = ((points < self.origin) | (points > self.upper)).any(axis=1)
+            if outside.any():
+                out[outside] = np.minimum(out[outside], self.beyond.lower_bound(points[outside]))
         return out
 
     def source_at(self, points: Float[np.ndarray, "n 3"]) -> Int16[np.ndarray, " n"]:
@@ -222,8 +229,25 @@ def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
     return NodeDistances(distance, source)
 
 
+def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
+    """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
+    distance = np.empty(grid.shape, dtype=np.float32)
+    source = np.empty(grid.shape, dtype=np.int16)
+    for start in range(0, grid.shape[0], 16):
+        stop = min(start + 16, grid.shape[0])
+        nodes = grid.slab(start, stop)
+        bound = np.maximum(field.lower_bound(nodes), 0.0)
+        distance[start:stop] = round_down(bound).reshape(-1, *grid.shape[1:])
+        source[start:stop] = field.source_at(nodes).reshape(-1, *grid.shape[1:])
+    return NodeDistances(distance, source)
+
+
 def finish(
-    nodes: NodeDistances, grid: Grid, sources: tuple[str, ...], solid_outside: bool
+    nodes: NodeDistances,
+    grid: Grid,
+    sources: tuple[str, ...],
+    solid_outside: bool,
+    beyond: DistanceField | None = None,
 ) -> DistanceField:
     """Give nodes inside obstacles their depth and make the field.
 
@@ -251,7 +275,7 @@ def finish(
     distance[np.isinf(distance)] = reach
     return DistanceField(
         grid.origin, grid.spacing, np.ascontiguousarray(distance), nodes.source, sources,
-        solid_outside,
+        solid_outside, beyond,
     )  # fmt: skip
 
 

@@ -17,6 +17,11 @@ _REACH = 0.6  # metres of room around the observed objects
 _UNDER = 0.02  # metres below the support plane
 _HEIGHT = 1.0  # metres above it, at least
 _MAX_NODES = 60_000_000
+# Beyond the grid: what the camera saw there, on coarse nodes. Farther from the objects no arm
+# that works on them reaches.
+_FAR_SPACING = 0.08  # metres
+_FAR_REACH = 4.4  # metres beyond the grid's sides
+_FAR_HEIGHT = 2.5  # metres above it
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,20 +58,35 @@ def is_level(plane: Plane | None) -> bool:
     return plane is not None and float(plane.normal[2]) > 0.99
 
 
-def _default_box(map_: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Box of the observed objects, grown by the room an arm moves in around them."""
+def _default_box(map_: Any, bounded: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Box of the observed objects and robot, grown by the room an arm moves in around them."""
     seen = []
     for view in map_.views:
         points, labels = view.points()
-        seen.append(points[labels > 0])
+        seen.append(points[(labels > 0) | view.sees_robot[view.depth > 0]])
     points = np.concatenate(seen) if seen else np.empty((0, 3))
     if len(points) == 0:
         points = np.stack(map_.support_bounds())
     lower, upper = points.min(axis=0) - _REACH, points.max(axis=0) + _REACH
     if is_level(map_.plane):
-        lower[2] = map_.plane.offset - _UNDER
+        lower[2] = min(lower[2], map_.plane.offset) if bounded else map_.plane.offset - _UNDER
         upper[2] = max(upper[2], map_.plane.offset + _HEIGHT)
     return lower, upper
+
+
+def grid_beyond(inner: Grid, plane: Plane | None, bounded: bool) -> Grid:
+    """Choose coarse nodes around a grid, as far as an arm beside the objects can reach.
+
+    Under a level table the support surface answers, unless it is `bounded`.
+    """
+    lower, upper = inner.origin - _FAR_REACH, inner.upper + _FAR_REACH
+    if is_level(plane):
+        lower[2] = inner.origin[2] - (_FAR_HEIGHT if bounded else 0.0)
+        upper[2] = inner.upper[2] + _FAR_HEIGHT
+    spacing = max(_FAR_SPACING, 2.0 * inner.spacing)
+    first = np.floor(lower / spacing).astype(np.int64)
+    x, y, z = (int(n) for n in np.ceil(upper / spacing).astype(np.int64) - first + 1)
+    return Grid(spacing, first, (x, y, z))
 
 
 def choose_grid(
@@ -79,7 +99,8 @@ def choose_grid(
     Raises:
         WorldError: the grid would have too many nodes to be of use.
     """
-    boxes = [_default_box(map_) if config.bounds is None else np.array(config.bounds)]
+    bounded = config.support == "seen"
+    boxes = [_default_box(map_, bounded) if config.bounds is None else np.array(config.bounds)]
     if level_box is not None:
         boxes.append(level_box)
     boxes += [item.box() for item in config.known if not isinstance(item, HalfSpace)]

@@ -15,16 +15,16 @@ from vprism_plan.world.distance import (
     finish,
 )
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
-from vprism_plan.world.unseen import BACKGROUND, OCCLUDED, UNOBSERVED
-from vprism_plan.world.world import World
+from vprism_plan.world.world import SUPPORT, World
 
 
 def source_field(world: World, name: str, without: Collection[int] = ()) -> DistanceField:
     """Distance to one of `world.sources` alone; baked on first use and kept with the world.
 
     At no node is it below `world.field`, so neither are the bounds between nodes; the
-    smallest over all sources is `world.field` wherever that is positive. An object's
-    own field holds its level set and its seen surfaces off it.
+    smallest over all sources is `world.field` wherever that is positive, less the end of what
+    was judged, metres away. An object's own field holds its level set and its seen surfaces
+    off it.
 
     Args:
         world: the world.
@@ -50,6 +50,7 @@ def source_field(world: World, name: str, without: Collection[int] = ()) -> Dist
 def _bake(world: World, name: str, gone: frozenset[int]) -> DistanceField:
     index = world.sources.index(name)
     solid_outside = name == "unobserved" and world.config.unobserved == "occupied"
+    beyond: DistanceField | None = None
     if name.startswith("known:"):
         solids: list[Primitive | KnownMesh] = [
             k
@@ -57,21 +58,28 @@ def _bake(world: World, name: str, gone: frozenset[int]) -> DistanceField:
             if not isinstance(k, HalfSpace) and f"known:{k.name}" == name
         ]
         nodes = combine(world._known_distances(solids), world.grid)
+    elif name == SUPPORT:
+        nodes = combine(world._support_distances(world.grid), world.grid)
+        far = combine(world._support_distances(world._grid_beyond), world._grid_beyond)
+        beyond = finish(far, world._grid_beyond, world.sources, False)
     else:
         marks = world._without(world._unseen, gone) if gone else world._unseen
-        mark = {"background": BACKGROUND, "occluded": OCCLUDED, "unobserved": UNOBSERVED}
-        own = _only(marks, mark.get(name, BACKGROUND + 1 + index))
-        far, found = distance_to_lattice(own, world.grid)
-        parts = [NodeDistances(far, found.astype(np.int16))]
-        if name.startswith("object:"):
+        mark = int(np.flatnonzero(world._sources_of_marks() == index)[0])
+        own, found = distance_to_lattice(_only(marks, mark), world.grid)
+        parts = [NodeDistances(own, found.astype(np.int16))]
+        if index < len(world.map.object_ids):
             parts.append(world._object_distances([index + 1]))
+        if world._marks_beyond is not None:
+            beyond, inside = world._around(_only(world._marks_beyond, mark), False)
+            parts += inside
         nodes = combine(parts, world.grid)
     distance = nodes.distance
     if solid_outside:  # the world's own distances stop at the faces of the grid
         faces = world._unseen_distances(_nothing(world._unseen)).distance
         distance = np.minimum(distance, faces)
     named = np.where(np.isfinite(distance), np.int16(index), np.int16(-1))
-    return finish(NodeDistances(distance, named), world.grid, world.sources, solid_outside)
+    nodes = NodeDistances(distance, named)
+    return finish(nodes, world.grid, world.sources, solid_outside, beyond)
 
 
 def _nothing(marks: Lattice) -> Lattice:

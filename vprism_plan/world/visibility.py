@@ -18,6 +18,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.strays import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import transform_points
+from vprism_plan.world.config import WorldConfig
 
 # Codes of points.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
@@ -25,7 +26,7 @@ SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
 _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
-_THIN = 0.003
+THIN = 0.003
 # Cells around the robot that it takes with it. Inside a cavity of occluded cells a field
 # whose nodes are two cells apart falls short of the distance by 2.8 cells at most.
 _ROOM = 2.0
@@ -39,7 +40,7 @@ def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape
     return 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
 
 
-def _height_sigma(
+def height_sigma(
     view: Observation,
     points: Float[np.ndarray, "n 3"],
     depth: Float[np.ndarray, " n"],
@@ -95,29 +96,54 @@ def make_view(observation: Observation, tolerance: float, plane: Plane | None = 
     or the coarse cells on a table seen at a glance would all hide behind one another.
     The robot casts one always, however low it is.
     """
-    K = observation.intrinsics
     depth = np.asarray(observation.depth, dtype=np.float64)
     valid = depth > 0
     reach = np.where(valid, depth + np.maximum(tolerance, 3.0 * depth_sigma(depth)), np.inf)
     if plane is not None:
         points = observation.point_image()[valid]
-        sigma = _height_sigma(observation, points, depth[valid], plane)
+        sigma = height_sigma(observation, points, depth[valid], plane)
         # Four, not three: one pixel in 700 would leave a speck on every open table.
-        threshold = np.maximum(_THIN, 4.0 * sigma)
+        threshold = np.maximum(THIN, 4.0 * sigma)
         on_plane = plane.signed_distance(points) < threshold
         if observation.labels is not None:
             on_plane &= observation.labels[valid] == 0
         on_plane &= ~observation.sees_robot[valid]
         reach[valid] = np.where(on_plane, np.inf, reach[valid])
-    rotation = observation.pose[:3, :3].T
+    return _view(observation, reach, valid, _robot_balls(observation))
+
+
+def _view(
+    observation: Observation,
+    reach: Float[np.ndarray, "h w"],
+    valid: Bool[np.ndarray, "h w"],
+    robot: Float[np.ndarray, "s 4"],
+) -> View:
+    K, rotation = observation.intrinsics, observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
     return View(
         camera=np.ascontiguousarray(camera),
         optics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64),
         reach=_sparse_tables(reach.astype(np.float32)),
         holes=_sparse_tables(valid.astype(np.float32)),
-        robot=_robot_balls(observation),
+        robot=robot,
     )
+
+
+def behind(
+    observation: Observation,
+    start: Float[np.ndarray, "h w"],
+    plane: Plane | None,
+    origin: Float[np.ndarray, " 3"],
+    spacing: float,
+    shape: tuple[int, int, int],
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """Cells (as for `classify_cells`) that reach behind the depth `start` (metres) of a pixel.
+
+    Pixels with an infinite `start` hide nothing.
+    """
+    view = _view(observation, start, np.ones(start.shape, dtype=bool), np.empty((0, 4)))
+    status = classify_cells([view], plane, origin, spacing, shape)
+    return (status == kernels.OCCLUDED) | (status == kernels.PARTLY)
 
 
 def _robot_balls(observation: Observation) -> Float[np.ndarray, "s 4"]:
@@ -127,6 +153,30 @@ def _robot_balls(observation: Observation) -> Float[np.ndarray, "s 4"]:
     spheres: np.ndarray = observation.robot_spheres.copy()
     spheres[:, :3] = transform_points(observation.pose, spheres[:, :3])
     return spheres
+
+
+def classify_cells_around(
+    views: Sequence[View],
+    below: Sequence[View],
+    plane: Plane,
+    origin: Float[np.ndarray, " 3"],
+    spacing: float,
+    shape: tuple[int, int, int],
+) -> UInt8[np.ndarray, "nx ny nz"]:
+    """`classify_cells` for a support plane that ends somewhere: what is lower counts as well.
+
+    Above the plane as `views` say, for which it casts no shadow; below, wherever a cell
+    reaches there, as the `below` views say, for which it hides things like any surface.
+    """
+    status = classify_cells(views, None, origin, spacing, shape)
+    under = classify_cells(below, None, origin, spacing, shape)
+    low = 0.5 * spacing * np.abs(plane.normal).sum()
+    middle = plane.signed_distance(origin + 0.5 * spacing)
+    x, y, z = (spacing * n * np.arange(k) for n, k in zip(plane.normal, shape, strict=True))
+    for layer in range(shape[0]):
+        reaches = middle + x[layer] + y[:, None] + z < low
+        np.copyto(status[layer], under[layer], where=reaches)
+    return status
 
 
 def classify_cells(
@@ -212,7 +262,7 @@ def classify_points(
     return _OF_POINT[status]
 
 
-def _beside(
+def beside(
     points: Float[np.ndarray, "n 3"], dense: Bool[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """Which points (m) are dense, or within half a block of one that is."""
@@ -222,35 +272,63 @@ def _beside(
     return np.asarray(np.isfinite(gap))
 
 
-def background_points(
-    views: Sequence[Observation], plane: Plane | None, height: float, lone_share: float = 0.0
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Unlabelled points off the support plane, and half the width of their pixels, metres.
+def clutter_pixels(
+    view: Observation,
+    plane: Plane | None,
+    height: float,
+    lone_share: float = 0.0,
+    bounded: bool = False,
+) -> Bool[np.ndarray, "h w"]:
+    """Which pixels show unlabelled things off the support plane.
 
     "Off" is `height` metres, or three standard deviations of the depth noise as it
-    shows along the normal, if that is more. Without a plane every unlabelled point is.
-    Points of the robot are not background, nor, if `lone_share` is above 0, are points
+    shows along the normal, if that is more. Without a plane every unlabelled pixel is.
+    Pixels of the robot are not clutter, nor, if `lone_share` is above 0, are points
     that with all others off the plane fill less than that share of what a surface facing
     the camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills
     3 percent. What lies within 1.5 cm of a point that is none stays: tips and edges lack
-    half their surroundings.
+    half their surroundings. Below the plane is "off" as well if the support is `bounded`.
     """
-    kept, widths = [], []
+    points, labels = view.points()
+    valid = view.depth > 0
+    depth = np.asarray(view.depth, dtype=np.float64)[valid]
+    chosen = (labels == 0) & ~view.sees_robot[valid]
+    if plane is not None:
+        threshold = np.maximum(height, 3.0 * height_sigma(view, points, depth, plane))
+        away = plane.signed_distance(points)
+        off = (np.abs(away) if bounded else away) > threshold
+        chosen &= off
+        if lone_share > 0.0:
+            focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
+            whole = (BLOCK * focal / depth[off]) ** 2
+            dense = points_around(points[off]) >= lone_share * whole
+            chosen[off] &= beside(points[off], dense)
+    found = np.zeros(view.shape, dtype=bool)
+    found[valid] = chosen
+    return found
+
+
+def background_points(
+    views: Sequence[Observation],
+    plane: Plane | None,
+    height: float,
+    lone_share: float = 0.0,
+    bounded: bool = False,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Points of the `clutter_pixels`, and half the width of their pixels, metres."""
+    kept, widths = [np.empty((0, 3))], [np.empty(0)]
     for view in views:
-        points, labels = view.points()
-        depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
+        chosen = clutter_pixels(view, plane, height, lone_share, bounded)
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-        chosen = (labels == 0) & ~view.sees_robot[view.depth > 0]
-        if plane is not None:
-            threshold = np.maximum(height, 3.0 * _height_sigma(view, points, depth, plane))
-            off = plane.signed_distance(points) > threshold
-            chosen &= off
-            if lone_share > 0.0:
-                whole = (BLOCK * focal / depth[off]) ** 2
-                dense = points_around(points[off]) >= lone_share * whole
-                chosen[off] &= _beside(points[off], dense)
-        kept.append(points[chosen])
-        widths.append(0.5 * depth[chosen] / focal)
-    if not kept:
-        return np.empty((0, 3)), np.empty(0)
+        kept.append(view.point_image()[chosen])
+        widths.append(0.5 * np.asarray(view.depth, dtype=np.float64)[chosen] / focal)
     return np.concatenate(kept), np.concatenate(widths)
+
+
+def clutter_depth(
+    view: Observation, plane: Plane | None, config: WorldConfig
+) -> Float[np.ndarray, "h w"]:
+    """Depth (metres) from which unlabelled clutter hides what is behind it, inf elsewhere."""
+    bounded = config.support == "seen"
+    chosen = clutter_pixels(view, plane, config.background_height, config.lone_share, bounded)
+    return np.where(chosen, np.asarray(view.depth, dtype=np.float64), np.inf)

@@ -4,6 +4,7 @@
 import logging
 import time
 from collections.abc import Collection
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -17,22 +18,25 @@ from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
     NodeDistances,
+    bounds_on,
     checked_points,
     combine,
     distance_to_lattice,
     finish,
     round_down,
 )
-from vprism_plan.world.grid import Grid, choose_grid
+from vprism_plan.world.grid import Grid, choose_grid, grid_beyond
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
 from vprism_plan.world.levelset import lattice_refinement, trace_level_set
 from vprism_plan.world.posterior_worlds import PosteriorWorlds
 from vprism_plan.world.rasterize import rasterize_level_set, rasterize_mesh
+from vprism_plan.world.support import RIM, SeenSupport, seen_support
 from vprism_plan.world.unseen import (
     BACKGROUND,
     CELLS,
     OCCLUDED,
     UNOBSERVED,
+    ids_without_depth,
     mark_unseen,
     unmark,
 )
@@ -40,6 +44,7 @@ from vprism_plan.world.unseen import (
 _log = logging.getLogger(__name__)
 
 _MAX_OBJECTS = 250
+SUPPORT = "support surface"
 
 
 class World:
@@ -49,8 +54,14 @@ class World:
     too thin for the map's kernels) are obstacles of that object, too.
 
     Everything is baked on construction. Sources, in this order: one per object, then
-    "background", "occluded", "unobserved", then known geometry; the support surface
-    and known half-spaces are not in the field but in `planes`.
+    "background", "occluded", "unobserved", labelled objects without any depth return, then
+    known geometry; the support surface and known half-spaces are not in the field but in
+    `planes`.
+
+    What was seen outside the grid, and its shadow, is kept on a coarse grid around it (nodes
+    8 cm apart, 4.4 m beyond its sides), so an obstacle there is up to two such steps nearer
+    than it is. Beyond that nothing was judged: everything counts as "unobserved" and as an
+    obstacle, whatever the policies say.
 
     Args:
         map: a `VPrismMap`.
@@ -76,9 +87,12 @@ class World:
         self.map = map
         self.config = WorldConfig() if config is None else config
         self.timings: dict[str, float] = {}
-        if len(map.object_ids) > _MAX_OBJECTS:
+        self._bounded = self.config.support == "seen" and map.plane is not None
+        lost = ids_without_depth(map)
+        if len(map.object_ids) + len(lost) > _MAX_OBJECTS:
             raise WorldError(
-                f"the map has {len(map.object_ids)} objects; a world holds at most {_MAX_OBJECTS}"
+                f"the map has {len(map.object_ids) + len(lost)} objects; a world holds at most "
+                f"{_MAX_OBJECTS}"
             )
         names = [f"object:{i}" for i in map.object_ids]
         solids = [k for k in self.config.known if not isinstance(k, HalfSpace)]
@@ -87,6 +101,8 @@ class World:
             "background",
             "occluded",
             "unobserved",
+            *(f"object:{i}" for i in lost),
+            *([SUPPORT] if self._bounded else []),
             *(f"known:{k.name}" for k in solids),
         )
         self.plane_names, self.planes = self._half_spaces()
@@ -101,18 +117,29 @@ class World:
             visibility.make_view(view, self.config.occlusion_tolerance, map.plane)
             for view in map.views
         ]
+        self._below: list[visibility.View] | None = None
+        self._support: SeenSupport | None = None
+        if self._bounded:
+            tolerance = self.config.occlusion_tolerance
+            self._below = [visibility.make_view(view, tolerance) for view in map.views]
+            self._support = seen_support(map.views, map.plane)
         self._objects: NodeDistances = self._timed(
             "distance to objects", self._object_distances, None
         )
         self._unseen = self._timed("visibility", self._mark_unseen, self.config.occluded)
+        self._marks_beyond = self._timed("beyond", self._mark_beyond)
+        self._beyond, self._from_beyond = self._around(self._marks_beyond, True)
         known = self._timed("known geometry", self._known_distances, solids)
+        known += self._support_distances(self.grid)
         self._known: NodeDistances = combine(known, self.grid)
         others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
         self.field: DistanceField = self._timed(
             "combine", self._field, [self._objects, others, self._known]
         )
+        self._said: tuple[str, ...] = ()
+        self._lowered: World | None = None
         self._cache: dict[tuple[str, frozenset[int]], DistanceField] = {}
-        self._beyond_support: Lattice | None = None
+        self._beyond_support: dict[bool, Lattice] = {}
         self._draws: dict[tuple[int, int], PosteriorWorlds] = {}
         _log.debug("world baked: %s nodes, %s", self.field.distance.size, self.timings)
 
@@ -134,8 +161,8 @@ class World:
 
     def _half_spaces(self) -> tuple[tuple[str, ...], Float[np.ndarray, "p 4"]]:
         names, rows = [], []
-        if self.map.plane is not None:
-            names.append("support surface")
+        if self.map.plane is not None and not self._bounded:
+            names.append(SUPPORT)
             rows.append([*self.map.plane.normal, self.map.plane.offset])
         for item in self.config.known:
             if isinstance(item, HalfSpace):
@@ -147,24 +174,93 @@ class World:
 
     def _mark_unseen(self, occluded: OccludedPolicy) -> Lattice:
         return mark_unseen(
-            self.map, self._views, self.config, occluded, self.grid, self._objects.distance
-        )
+            self.map, self._views, self.config, occluded, self.grid, self._objects.distance,
+            below=self._below,
+        )  # fmt: skip
+
+    def _mark_certain(self, seen: bool) -> Lattice:
+        """Mark what is no business of the posterior's; with `seen`, all seen surfaces too."""
+        occluded: OccludedPolicy = "free" if self.config.occluded == "free" else "posterior"
+        return mark_unseen(
+            self.map, self._views, self.config, occluded, self.grid,
+            None if seen else self._objects.distance, below=self._below,
+        )  # fmt: skip
 
     def _unseen_distances(self, lattice: Lattice) -> NodeDistances:
+        distance, label = distance_to_lattice(lattice, self.grid)
+        source = self._sources_of_marks()[label]
+        if self.config.unobserved == "occupied":
+            self._bound_by_faces(distance, source, self.grid)
+        return NodeDistances(distance, source)
+
+    def _sources_of_marks(self) -> np.ndarray:
+        """Index into `sources` of each mark of `world.unseen`, -1 for none, (256,)."""
+        classes = len(self.map.object_ids)
+        first = self.sources.index("unobserved") + 1
+        lost = len(ids_without_depth(self.map))
         names = np.full(256, -1, dtype=np.int16)
         names[BACKGROUND] = self.sources.index("background")
         names[OCCLUDED] = self.sources.index("occluded")
         names[UNOBSERVED] = self.sources.index("unobserved")
-        classes = len(self.map.object_ids)
-        names[BACKGROUND + 1 : BACKGROUND + 1 + classes] = np.arange(classes)
-        distance, label = distance_to_lattice(lattice, self.grid)
-        source = names[label]
-        if self.config.unobserved == "occupied":
-            faces = _distance_to_faces(self.grid)
-            closer = faces < distance
-            np.copyto(distance, faces, where=closer)
-            np.copyto(source, names[UNOBSERVED], where=closer)
+        marks = BACKGROUND + 1 + np.arange(classes + lost)
+        names[marks] = [*range(classes), *range(first, first + lost)]
+        return names
+
+    def _mark_beyond(self) -> Lattice | None:
+        """Mark what was seen outside the grid, unless all of that is an obstacle anyway."""
+        if self.config.unobserved == "occupied" or not self.map.views:
+            return None
+        occluded: OccludedPolicy = "free" if self.config.occluded == "free" else "occupied"
+        return mark_unseen(
+            self.map, self._views, self.config, occluded, self._grid_beyond, None,
+            inner=self.grid, below=self._below,
+        )  # fmt: skip
+
+    @property
+    def _grid_beyond(self) -> Grid:
+        return grid_beyond(self.grid, self.map.plane, self._bounded)
+
+    def _around(
+        self, marks: Lattice | None, faces: bool
+    ) -> tuple[DistanceField | None, list[NodeDistances]]:
+        """The field of marks outside the grid, and what it says inside, if there are any.
+
+        With `faces`, everything farther away is an obstacle as well.
+        """
+        if marks is None:
+            return None, []
+        grid = self._grid_beyond
+        distance, label = distance_to_lattice(marks, grid)
+        nodes = NodeDistances(distance, self._sources_of_marks()[label])
+        inside = []
+        if np.isfinite(distance).any():
+            inside = [bounds_on(finish(nodes, grid, self.sources, False), self.grid)]
+        if faces:
+            nodes = combine([nodes, *self._support_distances(grid)], grid)
+            self._bound_by_faces(nodes.distance, nodes.source, grid)
+        return finish(nodes, grid, self.sources, faces), inside
+
+    def _support_distances(self, grid: Grid) -> list[NodeDistances]:
+        if self._support is None:
+            return []
+        return [self._solid_distances(self._support, SUPPORT, grid)]
+
+    def _solid_distances(self, solid: Any, name: str, grid: Grid) -> NodeDistances:
+        """Distances of nodes to what has a signed distance, rounded down."""
+        distance = np.empty(grid.shape, dtype=np.float32)
+        for start in range(0, grid.shape[0], 16):
+            stop = min(start + 16, grid.shape[0])
+            outside = np.maximum(solid.signed_distance(grid.slab(start, stop)) - 1e-9, 0.0)
+            distance[start:stop] = round_down(outside).reshape(-1, *grid.shape[1:])
+        source = np.full(grid.shape, self.sources.index(name), dtype=np.int16)
         return NodeDistances(distance, source)
+
+    def _bound_by_faces(self, distance: np.ndarray, source: np.ndarray, grid: Grid) -> None:
+        """Count everything outside a grid as unobserved, and as an obstacle."""
+        away = _distance_to_faces(grid)
+        closer = away < distance
+        np.copyto(distance, away, where=closer)
+        np.copyto(source, np.int16(self.sources.index("unobserved")), where=closer)
 
     def _object_distances(self, classes: Collection[int] | None) -> NodeDistances:
         """Distance to the level set (of some classes only); class k is source k - 1."""
@@ -178,24 +274,20 @@ class World:
     def _known_distances(self, solids: list[Primitive | KnownMesh]) -> list[NodeDistances]:
         parts = []
         for item in solids:
-            index = self.sources.index(f"known:{item.name}")
+            name = f"known:{item.name}"
             if isinstance(item, KnownMesh):
                 lattice = rasterize_mesh(item, self.grid, CELLS)
                 distance, _ = distance_to_lattice(lattice, self.grid)
+                source = np.full(self.grid.shape, self.sources.index(name), dtype=np.int16)
+                parts.append(NodeDistances(distance, source))
             else:
-                distance = np.empty(self.grid.shape, dtype=np.float32)
-                for start in range(0, self.grid.shape[0], 16):
-                    stop = min(start + 16, self.grid.shape[0])
-                    exact = item.signed_distance(self.grid.slab(start, stop))
-                    outside = np.maximum(exact - 1e-9, 0.0)
-                    distance[start:stop] = round_down(outside).reshape(-1, *self.grid.shape[1:])
-            source = np.full(self.grid.shape, index, dtype=np.int16)
-            parts.append(NodeDistances(distance, source))
+                parts.append(self._solid_distances(item, name, self.grid))
         return parts
 
     def _field(self, parts: list[NodeDistances]) -> DistanceField:
-        nodes = combine(parts, self.grid)
-        return finish(nodes, self.grid, self.sources, self.config.unobserved == "occupied")
+        nodes = combine([*parts, *self._from_beyond], self.grid)
+        outside = self.config.unobserved == "occupied"
+        return finish(nodes, self.grid, self.sources, outside, self._beyond)
 
     # --- queries ---------------------------------------------------------------
 
@@ -235,7 +327,7 @@ class World:
         return self._cache[key]
 
     def certain_field(
-        self, without: Collection[int] = (), level_set: bool = False
+        self, without: Collection[int] = (), level_set: bool = False, seen: bool = False
     ) -> DistanceField:
         """Distance to what is an obstacle whatever the posterior says.
 
@@ -243,18 +335,21 @@ class World:
         by its policy, and occluded space where the map has too little support to judge
         (unless the policy is "free"). The rest is for `posterior_worlds` to say; with
         `level_set`, the objects where P(occupied) >= level belong to it as well. The
-        objects `without`, and their seen parts, are left out.
+        objects `without`, and their seen parts, are left out. With `seen`, so does whatever
+        was seen of an object, wherever the level set is.
 
         Raises:
             WorldError: the map has no such object.
         """
         gone = frozenset(self._classes(without))
-        key = ("certain and level set" if level_set else "certain", gone)
+        key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
         if key not in self._cache:
-            if self._beyond_support is None:
-                free = self.config.occluded == "free"
-                self._beyond_support = self._mark_unseen("free" if free else "posterior")
-            marks = self._without(self._beyond_support, gone) if gone else self._beyond_support
+            if seen not in self._beyond_support:
+                self._beyond_support[seen] = self._timed(
+                    "visibility beyond support", self._mark_certain, seen
+                )
+            kept = self._beyond_support[seen]
+            marks = self._without(kept, gone) if gone else kept
             parts = [self._unseen_distances(marks), self._known]
             if level_set:
                 rest = set(range(1, len(self.map.object_ids) + 1)) - gone
@@ -297,16 +392,17 @@ class World:
 
         0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or
         under the support surface. 2 (unobserved): outside every image, or no depth
-        return. 3: outside the grid.
+        return. 3: outside the grid and what was judged around it.
 
         Raises:
             WorldError: a point is not finite.
         """
         points = checked_points(points)
         status = visibility.classify_points(self._views, points)
-        if self.map.plane is not None:
+        if self.map.plane is not None and not self._bounded:
             status[self.map.plane.signed_distance(points) < 0.0] = visibility.OCCLUDED
-        outside = ((points < self.grid.origin) | (points > self.grid.upper)).any(axis=1)
+        judged = self.field if self._beyond is None else self._beyond
+        outside = ((points < judged.origin) | (points > judged.upper)).any(axis=1)
         status[outside] = visibility.OUTSIDE
         return status
 
@@ -328,11 +424,35 @@ class World:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is usable but odd about what this world was made of."""
-        return tuple(getattr(self.map, "warnings", ()))
+        return (*getattr(self.map, "warnings", ()), *self._said)
+
+    def for_base(self, base: Float[np.ndarray, " 3"]) -> "World":
+        """Return the world for a robot whose base stands there (world, metres).
+
+        This world, or with `support="auto"` and a base more than 5 cm below the support plane
+        one whose support surface ends where it was seen to end; baked once.
+
+        Raises:
+            PlaneNotFoundError: too little of the surface was seen to say where that is.
+        """
+        plane = self.map.plane
+        if self.config.support != "auto" or plane is None:
+            return self
+        lower = -float(plane.signed_distance(np.asarray(base, dtype=np.float64)))
+        if lower <= RIM:
+            return self
+        if self._lowered is None:
+            self._lowered = World(self.map, replace(self.config, support="seen"))
+            self._lowered._said = (
+                f"the robot's base stands {lower:.2f} m below the support plane, so the support "
+                f"surface counts only where it was seen and {RIM:g} m around; "
+                'WorldConfig(support="unbounded") makes all below its plane an obstacle',
+            )
+        return self._lowered
 
     @cached_property
     def empty(self) -> bool:
-        """Whether nothing but half-spaces is an obstacle."""
+        """Whether nothing but half-spaces is an obstacle in the grid."""
         return bool((self.field.source < 0).all())
 
 
