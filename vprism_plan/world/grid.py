@@ -19,9 +19,8 @@ _HEIGHT = 1.0  # metres above it, at least
 _MAX_NODES = 60_000_000
 # Beyond the grid: what the camera saw there, on coarse nodes. Farther from the objects no arm
 # that works on them reaches.
-_FAR_SPACING = 0.08  # metres
-_FAR_REACH = 4.4  # metres beyond the grid's sides
-_FAR_HEIGHT = 2.5  # metres above it
+_FAR_SPACING = 0.1  # metres
+_FAR_REACH = 4.4  # metres beyond the grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +80,7 @@ def grid_beyond(inner: Grid, plane: Plane | None, bounded: bool) -> Grid:
     """
     lower, upper = inner.origin - _FAR_REACH, inner.upper + _FAR_REACH
     if is_level(plane):
-        lower[2] = inner.origin[2] - (_FAR_HEIGHT if bounded else 0.0)
-        upper[2] = inner.upper[2] + _FAR_HEIGHT
+        lower[2] = inner.origin[2] - (_FAR_REACH if bounded else 0.0)
     spacing = max(_FAR_SPACING, 2.0 * inner.spacing)
     first = np.floor(lower / spacing).astype(np.int64)
     x, y, z = (int(n) for n in np.ceil(upper / spacing).astype(np.int64) - first + 1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pixels that carry an object's label and no depth: glass, black, shiny things.
 
-Somewhere along such a ray the object stands. Where, is bounded by what is around it: no
+Somewhere along such a ray the object's surface is. Where, is bounded by what is around it: no
 nearer than its neighbours and its foot on the support surface allow, and no farther than
 that surface.
 """
@@ -20,6 +20,7 @@ _OVERHANG = (0.03, 0.15)  # metres by which a thing may lean out over its foot, 
 _SLOPE = 2.0  # metres nearer per metre to the side: how steeply a seen surface may go on
 _NEAR = 0.01  # metres a surface may bulge beside what was seen of it
 _BESIDE = 3  # pixels around a mask that count as beside it
+_PIECE = 200_000  # points at a time
 
 
 def lost_objects(view: Observation) -> tuple[int, ...]:
@@ -32,44 +33,89 @@ def lost_objects(view: Observation) -> tuple[int, ...]:
 
 def lost_cones(
     view: Observation, plane: Plane | None
-) -> Iterator[tuple[int, Float[np.ndarray, "h w"]]]:
-    """Yield each id of `lost_objects` and the depth (m) where its cone begins, inf elsewhere.
+) -> Iterator[tuple[int, Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]]:
+    """Yield each id of `lost_objects` and between which depths (m) its pixels' cones lie.
 
-    The cone of a pixel without a return runs from the nearest depth at which the object is
-    plausible down to the support surface. Nearest is the farthest of: the upright plane
-    through the front of its foot, of its other points and of what is seen beside its mask,
-    moved towards the camera by half its width; the height of 40 cm; and its own nearest seen
-    surface, continued towards the camera at two metres per metre.
+    The cone of a pixel without a return runs from the nearest depth at which the object's
+    surface is plausible to the farthest, or to the support surface. Nearest is the farthest of:
+    the upright plane through the front of its foot, of its other points and of what is seen
+    beside its mask, moved towards the camera by half its width; the height of 40 cm; and its
+    own nearest seen surface, continued towards the camera at two metres per metre. Farthest is
+    that surface continued away from the camera. Other pixels have no cone: inf, -inf.
     """
     lost_ids = lost_objects(view)
     if not lost_ids:
         return
     rays = pixel_rays(view.shape, view.intrinsics) @ view.pose[:3, :3].T
     points = view.point_image()
+    at_plane = np.full(view.shape, np.inf)
+    if plane is not None:
+        sinking = -(rays @ plane.normal)
+        height = float(plane.signed_distance(view.camera_center))
+        at_plane[sinking > 0.0] = height / sinking[sinking > 0.0]
     for object_id in lost_ids:
         mask = view.labels == object_id
         lost = mask & (view.depth == 0)
-        start = np.maximum(_beside_own_surface(view, mask), 0.0)
+        start, end = _beside_own_surface(view, mask)
         if plane is not None:
-            start = np.maximum(start, _before_foot(view, plane, mask, lost, rays, points))
-        yield object_id, np.where(lost, start, np.inf)
+            foot = _before_foot(view, plane, mask, lost, rays, points, at_plane)
+            start = np.maximum(start, foot)
+        end = np.minimum(end, at_plane)
+        yield object_id, np.where(lost, start, np.inf), np.where(lost, end, -np.inf)
+
+
+def lost_points(
+    view: Observation,
+    plane: Plane | None,
+    lower: Float[np.ndarray, " 3"],
+    upper: Float[np.ndarray, " 3"],
+    step: float,
+) -> Iterator[tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]]:
+    """Yield points `step` apart along all `lost_cones` in a box, with the half edge of cubes
+    around them that hold the cones; piece by piece, world, metres."""
+    eye = view.camera_center
+    focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
+    for object_id, start, end in lost_cones(view, plane):
+        pixels = np.argwhere(start < end)
+        rays = pixel_rays(view.shape, view.intrinsics)[tuple(pixels.T)] @ view.pose[:3, :3].T
+        length = np.linalg.norm(rays, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ways = np.stack([(lower - step - eye) / rays, (upper + step - eye) / rays])
+        first = np.fmax(start[tuple(pixels.T)], np.nanmax(ways.min(axis=0), axis=1))
+        last = np.fmin(end[tuple(pixels.T)], np.nanmin(ways.max(axis=0), axis=1))
+        counts = np.ceil(np.maximum(last - first, 0.0) * length / step).astype(np.int64) + 1
+        counts[last < first] = 0
+        for piece in np.array_split(np.arange(len(pixels)), counts.sum() // _PIECE + 1):
+            count = counts[piece]
+            owner = np.repeat(piece, count)
+            index = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
+            share = index / np.maximum(np.repeat(count, count) - 1, 1)
+            depth = first[owner] + share * (last - first)[owner]
+            # A pixel's corner is 0.71 of its width off its middle.
+            yield object_id, eye + depth[:, None] * rays[owner], 0.71 * depth / focal + 0.5 * step
 
 
 def _beside_own_surface(
     view: Observation, mask: Bool[np.ndarray, "h w"]
-) -> Float[np.ndarray, "h w"]:
-    """Nearest depth that the object's own seen pixels allow; 0 where it has none."""
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Nearest and farthest depth that the object's own seen pixels allow; 0, inf without any."""
     own = mask & (view.depth > 0)
     if not own.any():
-        return np.zeros(view.shape)
-    depth = np.where(own, view.depth.astype(np.float64), np.inf)
-    # One flying pixel behind the object must not push the cone back.
-    depth = ndimage.minimum_filter(depth, 2 * _BESIDE + 1, mode="nearest")
+        return np.zeros(view.shape), np.full(view.shape, np.inf)
+    depth = view.depth.astype(np.float64)
+    # Of several surfaces nearby, a flying pixel among them, each may be the one that goes on.
+    size = 2 * _BESIDE + 1
+    low = ndimage.minimum_filter(np.where(own, depth, np.inf), size, mode="nearest")
+    high = ndimage.maximum_filter(np.where(own, depth, 0.0), size, mode="nearest")
     away, index = ndimage.distance_transform_edt(~own, return_indices=True)
-    nearest = depth[tuple(index)]
     focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-    # Divided by the steepness, since the way to the side is measured at the depth sought.
-    return np.asarray((nearest - _NEAR) / (1.0 + _SLOPE * away / focal))
+    # The way to the side is measured at the depth sought.
+    steep = _SLOPE * away / focal
+    start = np.maximum(low[tuple(index)] - _NEAR, 0.0) / (1.0 + steep)
+    end = np.full(view.shape, np.inf)
+    near = steep < 1.0
+    end[near] = (high[tuple(index)] + _NEAR)[near] / (1.0 - steep[near])
+    return start, end
 
 
 def _before_foot(
@@ -79,14 +125,14 @@ def _before_foot(
     lost: Bool[np.ndarray, "h w"],
     rays: Float[np.ndarray, "h w 3"],
     points: Float[np.ndarray, "h w 3"],
+    at_plane: Float[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w"]:
     """Nearest depth (m) by where the object can stand and how tall it can be."""
     eye = view.camera_center
     height = float(plane.signed_distance(eye))
     sinking = -(rays @ plane.normal)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at_plane = np.where(sinking > 0.0, height / sinking, np.inf)
-        below_top = np.where(sinking > 0.0, (height - _TALLEST) / sinking, 0.0)
+    with np.errstate(divide="ignore"):
+        below_top = np.where(sinking > 0.0, np.maximum(height - _TALLEST, 0.0) / sinking, 0.0)
     ahead = rays[mask].mean(axis=0)
     ahead -= (ahead @ plane.normal) * plane.normal
     length = float(np.linalg.norm(ahead))

@@ -12,7 +12,7 @@ from vprism_plan.world import visibility
 from vprism_plan.world.config import OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import Lattice
 from vprism_plan.world.grid import Grid
-from vprism_plan.world.lost_depth import lost_cones, lost_objects
+from vprism_plan.world.lost_depth import lost_objects, lost_points
 from vprism_plan.world.seen_surfaces import surface_points
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
@@ -93,12 +93,10 @@ def mark_unseen(
         mark(points, half, BACKGROUND + k)
     ids = (*map_.object_ids, *ids_without_depth(map_))
     for view in map_.views:
-        for object_id, start in lost_cones(view, map_.plane):
-            cone = visibility.behind(view, start, map_.plane, grid.origin, spacing, shape)
-            if hole is not None:
-                cone[hole] = False
-            marked = np.where(cone, np.uint8(BACKGROUND + 1 + ids.index(object_id)), np.uint8(0))
-            _mark_corners(marked, nodes)
+        for object_id, points, half in lost_points(
+            view, map_.plane, grid.origin, grid.upper, 0.5 * spacing
+        ):
+            mark(points, half, BACKGROUND + 1 + ids.index(object_id))
     return Lattice(nodes, grid.first * CELLS, CELLS)
 
 
@@ -169,7 +167,7 @@ def unmark(marks: Lattice, classes: Collection[int], inside: Lattice | None) -> 
 
 
 def _mark_corners(cells: UInt8[np.ndarray, "x y z"], nodes: UInt8[np.ndarray, "x1 y1 z1"]) -> None:
-    """Give every node the largest mark of the eight cells around it."""
+    """Raise every node to the largest mark of the eight cells around it."""
     x, y, z = cells.shape
     grown = np.zeros((x + 1, y, z), dtype=np.uint8)
     grown[:-1] = cells
@@ -177,5 +175,5 @@ def _mark_corners(cells: UInt8[np.ndarray, "x y z"], nodes: UInt8[np.ndarray, "x
     wider = np.zeros((x + 1, y + 1, z), dtype=np.uint8)
     wider[:, :-1] = grown
     np.maximum(wider[:, 1:], grown, out=wider[:, 1:])
-    nodes[:, :, :-1] = wider
+    np.maximum(nodes[:, :, :-1], wider, out=nodes[:, :, :-1])
     np.maximum(nodes[:, :, 1:], wider, out=nodes[:, :, 1:])

@@ -59,7 +59,7 @@ class World:
     `planes`.
 
     What was seen outside the grid, and its shadow, is kept on a coarse grid around it (nodes
-    8 cm apart, 4.4 m beyond its sides), so an obstacle there is up to two such steps nearer
+    10 cm apart, 4.4 m beyond its faces), so an obstacle there is up to two such steps nearer
     than it is. Beyond that nothing was judged: everything counts as "unobserved" and as an
     obstacle, whatever the policies say.
 
@@ -234,7 +234,10 @@ class World:
         nodes = NodeDistances(distance, self._sources_of_marks()[label])
         inside = []
         if np.isfinite(distance).any():
-            inside = [bounds_on(finish(nodes, grid, self.sources, False), self.grid)]
+            within = bounds_on(finish(nodes, grid, self.sources, False), self.grid)
+            # All of it lies outside: the grid's faces are nearer.
+            np.maximum(within.distance, _distance_to_faces(self.grid), out=within.distance)
+            inside = [within]
         if faces:
             nodes = combine([nodes, *self._support_distances(grid)], grid)
             self._bound_by_faces(nodes.distance, nodes.source, grid)
