@@ -76,7 +76,7 @@ def reading(
         raise
     except Exception as unknown:
         raise error(
-            one_line(f"{path} is not {what}: {type(unknown).__name__}: {unknown}")
+            one_line(f"'{path}' is not {what}: {type(unknown).__name__}: {unknown}")
         ) from unknown
 
 

@@ -154,11 +154,10 @@ def test_any_flipped_bit_is_noticed_or_without_effect(saved, small_map, tmp_path
         whole[place // 8] ^= 1 << (place % 8)
         try:
             found = load_map(path)
-        except MapError as error:
-            assert "\n" not in str(error)
-        else:
-            loaded += 1
-            assert same_answers(found, small_map, query), f"bit {place}"
+        except MapError:
+            continue
+        loaded += 1
+        assert same_answers(found, small_map, query), f"bit {place}"
     assert loaded < 10
 
 

@@ -76,13 +76,12 @@ def number(content: dict[str, Any], key: str, path: Path, default: float | None 
     """Return a finite number from a JSON object, or name what is missing."""
     if key not in content and default is not None:
         return default
-    value = content.get(key)
-    # Not so for whole numbers that are too large for a float either.
-    small = isinstance(value, int | float) and abs(value) <= sys.float_info.max
-    if isinstance(value, bool) or not small:
-        found = "is missing" if key not in content else f"is {value!r}"
-        raise ObservationError(f"{path}: {key!r} {found}; it must be a finite number")
-    return float(value)
+    value: Any = content.get(key)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and abs(value) <= sys.float_info.max:  # else float() fails on whole numbers
+        return float(value)
+    found = "is missing" if key not in content else f"is {value!r}"
+    raise ObservationError(f"{path}: {key!r} {found}; it must be a finite number")
 
 
 def positive_number(
