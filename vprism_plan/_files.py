@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files appear whole or not at all: written beside their place, then renamed into it."""
+"""Files appear whole or not at all, and whatever is in one that is read, it fails in one line."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+from vprism_plan.errors import VPrismError
+
+_LONGEST = 1000  # characters of a message about a file
+MOST_TEXT = 2**25  # bytes of a text that is read: 32 MiB
 
 
 @contextmanager
@@ -37,3 +44,60 @@ def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text to `path`, whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def reading(
+    path: str | Path, what: str, error: type[VPrismError], most: int | None = None
+) -> Iterator[None]:
+    """Let nothing but errors of this package out of a block that reads a file.
+
+    A file from elsewhere may be damaged or made on purpose, and readers then raise anything:
+    RecursionError, MemoryError, TypeError, their own. Messages are cut to one line, because
+    what they quote comes from the file.
+
+    Args:
+        path: the file, or a folder of several.
+        what: it should be: "a readable map".
+        error: to raise.
+        most: bytes; a larger file is refused unread.
+
+    Raises:
+        VPrismError: `error`, or what the block raises of this kind.
+    """
+    try:
+        if most is not None and Path(path).stat().st_size > most:
+            raise error(
+                f"{path} has {Path(path).stat().st_size:,} bytes; at most {most:,} are read"
+            )
+        yield
+    except VPrismError as known:
+        known.args = (one_line(known),)
+        raise
+    except Exception as unknown:
+        raise error(
+            one_line(f"'{path}' is not {what}: {type(unknown).__name__}: {unknown}")
+        ) from unknown
+
+
+def one_line(text: object, most: int = _LONGEST) -> str:
+    """Return a text as one printable line, its middle left out if it is long."""
+    line = " ".join(str(text).split())
+    if len(line) > most:
+        line = f"{line[: most // 2]} [...] {line[-most // 2 :]}"
+    return "".join(c if c.isprintable() else "?" for c in line)
+
+
+def read_json(path: Path, error: type[VPrismError]) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Raises:
+        VPrismError: `error`, if there is none.
+    """
+    if not path.is_file():
+        raise error(f"{path} is missing")
+    with reading(path, "readable JSON", error, MOST_TEXT):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise error(f"{path} holds a {type(content).__name__}; it must be an object")
+        return content

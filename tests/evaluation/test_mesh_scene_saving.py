@@ -185,7 +185,7 @@ def test_damage_is_named(scene, tmp_path):
     truth = tmp_path / GROUND_TRUTH
     whole = truth.read_text()
     for damaged, message in (
-        (whole.replace('"seed"', '"sid"'), r"is not whole: KeyError\('seed'\)"),
+        (whole.replace('"seed"', '"sid"'), "is not whole: KeyError: 'seed'"),
         (whole.replace("version 1", "version 9"), "version 9"),
         ("{", "not readable JSON"),
     ):

@@ -11,7 +11,7 @@ from safetensors.numpy import save_file
 
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import load_map
-from vprism_plan.mapping.serialization import FORMAT_VERSION
+from vprism_plan.mapping.serialization import FORMAT_VERSION, content_digest
 
 
 @pytest.fixture(scope="module")
@@ -21,17 +21,17 @@ def saved(small_map, tmp_path_factory):
     return path
 
 
-def rewrite(saved, path, meta=None, **tensors):
+def rewrite(saved, path, meta=None, digest=None, **tensors):
+    """A map file with some of its content exchanged, and a digest that is right for it."""
     with safe_open(saved, framework="numpy") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         header = json.loads(file.metadata()["vprism_plan"])
     arrays.update(tensors)
     header.update(meta or {})
-    save_file(
-        {k: np.ascontiguousarray(v) for k, v in arrays.items() if v is not None},
-        path,
-        metadata={"vprism_plan": json.dumps(header)},
-    )
+    arrays = {k: np.ascontiguousarray(v) for k, v in arrays.items() if v is not None}
+    text = json.dumps(header)
+    digest = content_digest(text, arrays) if digest is None else digest
+    save_file(arrays, path, metadata={"vprism_plan": text, "sha256": digest})
     return path
 
 
@@ -102,7 +102,7 @@ def test_missing_truncated_and_foreign_files(saved, tmp_path):
         load_map(tmp_path / "none.safetensors")
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(saved.read_bytes()[:5000])
-    with pytest.raises(MapError, match="cannot be read"):
+    with pytest.raises(MapError, match="not a readable map"):
         load_map(cut)
     foreign = tmp_path / "foreign.safetensors"
     save_file({"a": np.zeros(3)}, foreign)
@@ -122,3 +122,91 @@ def test_another_version_and_damage_are_named(saved, tmp_path):
         load_map(rewrite(saved, path, hinges=None))
     with pytest.raises(MapError, match="damaged"):
         load_map(rewrite(saved, path, {"config": {"gamma": 3.0}}))
+
+
+def same_answers(found, expected, query):
+    """Whether two maps say the same, bit by bit, of what is there and of what was seen."""
+    views = zip(found.views, expected.views, strict=True)
+    return (
+        (found.object_ids, found.config, found.seed, found.warnings)
+        == (expected.object_ids, expected.config, expected.seed, expected.warnings)
+        and np.array_equal(found.predict_proba(query), expected.predict_proba(query))
+        and np.array_equal(found.plane.normal, expected.plane.normal)
+        and found.plane.offset == expected.plane.offset
+        and all(
+            np.array_equal(getattr(a, part), getattr(b, part))
+            for a, b in views
+            for part in ("depth", "labels", "intrinsics", "T_world_camera")
+        )
+    )
+
+
+def test_any_flipped_bit_is_noticed_or_without_effect(saved, small_map, tmp_path, query):
+    whole = bytearray(saved.read_bytes())
+    header = 8 + int.from_bytes(whole[:8], "little")
+    rng = np.random.default_rng(0)
+    # Most bits are numbers; a header's are names, shapes and what the map is.
+    places = [*rng.integers(0, 8 * len(whole), 20), *rng.integers(0, 8 * header, 40)]
+    path, loaded = tmp_path / "m.safetensors", 0
+    for place in places:
+        whole[place // 8] ^= 1 << (place % 8)
+        path.write_bytes(whole)
+        whole[place // 8] ^= 1 << (place % 8)
+        try:
+            found = load_map(path)
+        except MapError:
+            continue
+        loaded += 1
+        assert same_answers(found, small_map, query), f"bit {place}"
+    assert loaded < 10
+
+
+CRAFTED = {
+    "no views": ({"views": 0}, {}, "learned from one"),
+    "fewer views": ({"views": 10**12}, {}, "learned from one"),
+    "a view too many": ({"views": 2}, {}, "view 1 has no depth"),
+    "a stray tensor": ({}, {"view7.depth": np.ones((2, 2))}, r"view7\.depth belong to none"),
+    "ids in no order": ({"object_ids": [2, 1]}, {}, "positive and rise"),
+    "an id of 0": ({"object_ids": [0, 1]}, {}, "positive and rise"),
+    "an id twice": ({"object_ids": [1, 1]}, {}, "positive and rise"),
+    "ids that nobody saw": ({"object_ids": [1, 2, 9]}, {}, "views show"),
+    "a radius of another kernel": ({"radius": (0.5).hex()}, {}, "radius"),
+    "a seed": ({"seed": -1}, {}, "seed"),
+    "warnings": ({"warnings": [3]}, {}, "sentences"),
+    "a plane": ({}, {"plane": np.array([0.0, 0.0, 2.0, 0.1])}, "unit normal"),
+    "a history": ({}, {"history": np.array([np.nan])}, "history"),
+}
+
+
+@pytest.mark.parametrize("name", CRAFTED)
+def test_parts_that_do_not_fit_together_are_named(saved, tmp_path, name):
+    meta, tensors, message = CRAFTED[name]
+    with pytest.raises(MapError, match=message):
+        load_map(rewrite(saved, tmp_path / "m.safetensors", meta, **tensors))
+
+
+def test_covariances_of_another_posterior_are_refused(saved, tmp_path):
+    path, loaded = tmp_path / "m.safetensors", load_map(saved)
+    posterior = loaded.posterior
+    diagonal = loaded.space.diagonal
+    negative = posterior.covariance.copy()
+    negative[diagonal[3], 1] *= -1.0
+    with pytest.raises(MapError, match="not positive"):
+        load_map(rewrite(saved, path, covariance=negative))
+    with pytest.raises(MapError, match="not of one posterior"):
+        load_map(rewrite(saved, path, covariance=1e-3 * posterior.covariance))
+    with pytest.raises(MapError, match="not of one posterior"):
+        load_map(rewrite(saved, path, log_determinant=posterior.log_determinant + 1e5))
+
+
+def test_hinges_whose_pairs_would_fill_the_memory_are_refused(saved, tmp_path):
+    same = np.zeros((200_000, 3))  # 2e10 pairs
+    with pytest.raises(MapError, match="200000 hinges make"):
+        load_map(rewrite(saved, tmp_path / "m.safetensors", hinges=same))
+    with pytest.raises(MapError, match="farther than"):
+        load_map(rewrite(saved, tmp_path / "m.safetensors", hinges=np.full((5, 3), 1e300)))
+
+
+def test_a_wrong_digest_is_refused(saved, tmp_path):
+    with pytest.raises(MapError, match="SHA-256"):
+        load_map(rewrite(saved, tmp_path / "m.safetensors", digest="0" * 64))

@@ -25,7 +25,8 @@ block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 
 """
 
 import numpy as np
-from numba import njit
+
+from vprism_plan._kernels.jit import njit
 
 _INF = np.inf
 # Radians or metres: what turns or slides farther is refused. Up to here a whole number of turns

@@ -12,9 +12,11 @@ import math
 
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from vprism_plan._kernels.jit import njit
 
 BLOCK = 16  # points per block at most; also the width, padded with zeros, of its features
 _LANES = 8  # doubles per vector; two vectors hold a block

@@ -11,7 +11,8 @@ not notice that the other changed), so the few lines of kinematics are here once
 """
 
 import numpy as np
-from numba import njit
+
+from vprism_plan._kernels.jit import njit
 
 UNBAKED = np.int32(-1)  # as in `risk`
 _MAX_TURN = 0.5  # radians per step, as in `checking`

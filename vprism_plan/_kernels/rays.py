@@ -7,7 +7,8 @@ It releases the GIL. A kernel calls only kernels of this file.
 import math
 
 import numpy as np
-from numba import njit
+
+from vprism_plan._kernels.jit import njit
 
 
 @njit(cache=True, nogil=True)

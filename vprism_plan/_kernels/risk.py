@@ -14,7 +14,8 @@ Tables (see `vprism_plan.world.posterior_worlds`):
 """
 
 import numpy as np
-from numba import njit
+
+from vprism_plan._kernels.jit import njit
 
 FREE = np.int32(-2)
 UNBAKED = np.int32(-1)

@@ -11,7 +11,8 @@ into joint gradients: moments about the joints' axes, summed from the leaves to 
 import math
 
 import numpy as np
-from numba import njit
+
+from vprism_plan._kernels.jit import njit
 
 _SHORT = 1e-6  # metres; as in vprism_plan.trajopt._samples
 

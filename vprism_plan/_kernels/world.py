@@ -8,7 +8,8 @@ thread pool can run it in pieces. A kernel calls only kernels of this file.
 import math
 
 import numpy as np
-from numba import njit
+
+from vprism_plan._kernels.jit import njit
 
 # Larger than any squared distance in lattice units that a grid can hold.
 FAR = np.int32(2**30)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The command `view`: a map or a plan in the browser."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vprism_plan._files import read_json, reading
 from vprism_plan.cli._commands import View
 from vprism_plan.cli._console import Console
 from vprism_plan.cli._motions import standing
@@ -79,10 +79,10 @@ def load(path: Path) -> tuple["VPrismMap", dict[str, Any] | None]:
             f"{path} holds no map.safetensors and report.json; give the output folder of "
             "`vprism-plan plan` or `demo`, or a .safetensors map"
         )
-    try:
-        report = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise MapError(f"{file} is no JSON: {error}; plan again") from error
+    report = read_json(file, MapError)
+    with reading(file, "a report of `plan`", MapError):
+        if "base_pose" in report:
+            report["base_pose"] = np.array(report["base_pose"], dtype=np.float64)
     return load_map(path / "map.safetensors"), report
 
 
@@ -117,7 +117,7 @@ def _placed(
     """Return the robot where it is asked to stand, where it stood, or where it would stand."""
     around = Surroundings.of(m)
     if plan is not None and "base_pose" in plan and command.base_xyz is None:
-        pose = np.array(plan["base_pose"], dtype=np.float64)
+        pose = plan["base_pose"]
         if command.base_yaw is not None:
             pose = base_pose(pose[:3, 3], around, command.base_yaw)
         return robot.with_base_pose(pose)

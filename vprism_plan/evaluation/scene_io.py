@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from vprism_plan._files import write_text
+from vprism_plan._files import read_json, reading, write_text
 from vprism_plan.errors import ObservationError
 from vprism_plan.evaluation.camera import Camera, DepthNoise
 from vprism_plan.evaluation.scenes import Scene
@@ -80,8 +80,8 @@ def load_ground_truth(path: str | Path) -> Scene:
     truth = _truth_path(Path(path))
     if not truth.is_file():
         raise ObservationError(f"{truth} does not exist; a scene is written by save_scene")
-    data: dict[str, Any] = json.loads(truth.read_text(encoding="utf-8"))
-    return scene_from_dict(data)
+    with reading(truth, "the truth of a scene", ObservationError):
+        return scene_from_dict(read_json(truth, ObservationError))
 
 
 def _truth_path(path: Path) -> Path:

@@ -2,21 +2,27 @@
 """Maps on disk: one safetensors file, JSON in its header, no pickle.
 
 The tensors are the posterior exactly as it is used, so a loaded map answers with the
-same bits. The header key "vprism_plan" holds version, configuration, object ids, plane,
-seed, bound and which parts each view has.
+same bits. The header key "vprism_plan" holds version, configuration, object ids, seed,
+warnings, the number of views and the kernel's radius; "sha256" a digest of that and of all
+tensors. A file that is not what was written is refused: one bit of it can free a shadow.
 """
 
+import hashlib
 import json
+import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.numpy import save_file
+from scipy.spatial import cKDTree
 
-from vprism_plan._files import replacing
-from vprism_plan.errors import MapError, VPrismError
+from vprism_plan._files import reading, replacing
+from vprism_plan._numbers import is_whole
+from vprism_plan.errors import ConfigError, MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior
 from vprism_plan.mapping.features import FeatureSpace
@@ -26,9 +32,12 @@ from vprism_plan.perception.plane import Plane
 if TYPE_CHECKING:
     from vprism_plan.mapping.posterior import VPrismMap
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _HEADER = "vprism_plan"
-_VIEW_PARTS = ("depth", "labels", "intrinsics", "T_world_camera", "color", "robot_spheres")
+_DIGEST = "sha256"
+_NEEDED_PARTS = ("depth", "labels", "intrinsics")
+_VIEW_PARTS = (*_NEEDED_PARTS, "T_world_camera", "color", "robot_spheres")
+_FARTHEST = 1e6  # metres; kernels count cells up to the farthest hinge
 
 
 def save_map(fitted: "VPrismMap", path: str | Path) -> None:
@@ -62,8 +71,20 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
     arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     if not path.parent.is_dir():
         raise MapError(f"cannot write {path}: the folder {path.parent} does not exist")
+    text = json.dumps(meta)
+    header = {_HEADER: text, _DIGEST: content_digest(text, arrays)}
     with replacing(path) as temporary:
-        save_file(arrays, temporary, metadata={_HEADER: json.dumps(meta)})
+        save_file(arrays, temporary, metadata=header)
+
+
+def content_digest(meta: str, tensors: Mapping[str, np.ndarray]) -> str:
+    """Return the SHA-256 of everything that a map file says, as 64 hexadecimal digits."""
+    digest = hashlib.sha256(meta.encode())
+    for name in sorted(tensors):
+        array = np.ascontiguousarray(tensors[name])
+        digest.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.data.cast("B") if array.size else b"")
+    return digest.hexdigest()
 
 
 def load_map(path: str | Path) -> "VPrismMap":
@@ -72,59 +93,93 @@ def load_map(path: str | Path) -> "VPrismMap":
     Raises:
         MapError: no such file, not a map, a version this release does not read, or damaged.
     """
-    from vprism_plan.mapping.posterior import VPrismMap
-
     path = Path(path)
     if not path.is_file():
         raise MapError(f"no map at {path}; write one with VPrismMap.save")
-    meta, tensors = _read(path)
-    if meta.get("version") != FORMAT_VERSION:
-        raise MapError(
-            f"{path} is a map of format version {meta.get('version')!r}; this release reads "
-            f"version {FORMAT_VERSION}; fit it again"
-        )
-    try:
-        config = MapConfig(
-            **{**meta["config"], "hinge_shift": tuple(meta["config"]["hinge_shift"])}
-        )
-        space = FeatureSpace(tensors["hinges"], config.gamma, float.fromhex(meta["radius"]))
-        posterior = Posterior(
-            tensors["mean"],
-            tensors["covariance"],
-            tensors["precision"],
-            tensors["log_determinant"],
-            tuple(tensors["history"].tolist()),
-        )
-        object_ids = tuple(int(i) for i in meta["object_ids"])
-        _check_sizes(path, space, posterior, object_ids)
-        views = tuple(_view(tensors, index) for index in range(int(meta["views"])))
-        plane = _plane(tensors["plane"])
-        warnings = tuple(str(text) for text in meta.get("warnings", ()))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, VPrismError):
-            raise
-        raise MapError(f"{path} is a damaged map ({error!r}); fit it again") from error
-    return VPrismMap(
-        config, object_ids, plane, views, space, posterior, int(meta["seed"]), warnings
-    )
+    with reading(path, "a readable map", MapError):
+        meta, tensors = _read(path)
+        try:
+            return _restored(meta, tensors)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            # Of this package's errors only the text is worth showing, not the kind.
+            known = isinstance(error, MapError | ObservationError | ConfigError)
+            raise MapError(
+                f"{path} is a damaged map ({error if known else repr(error)}); fit it again"
+            ) from error
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = (file.metadata() or {}).get(_HEADER)
-            if header is None:
-                raise MapError(f"{path} is a safetensors file, but not a map of this package")
-            tensors = {name: np.ascontiguousarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
-        return json.loads(header), tensors
-    except (SafetensorError, json.JSONDecodeError, OSError) as error:
-        raise MapError(f"{path} cannot be read as a map: {error}; fit it again") from error
+    """Return what a file says, as it was written."""
+    with safe_open(path, framework="numpy") as file:
+        header = file.metadata() or {}
+        if _HEADER not in header:
+            raise MapError(f"{path} is a safetensors file, but not a map of this package")
+        meta = json.loads(header[_HEADER])
+        if meta["version"] != FORMAT_VERSION:
+            raise MapError(
+                f"{path} is a map of format version {meta['version']!r}; this release reads "
+                f"version {FORMAT_VERSION}; fit it again"
+            )
+        tensors = {name: np.ascontiguousarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+    if content_digest(header[_HEADER], tensors) != header.get(_DIGEST):
+        raise MapError(
+            f"{path} is damaged: its SHA-256 digest is not that of its content; copy the file "
+            "again, or fit the map again"
+        )
+    return meta, tensors
 
 
-def _check_sizes(
-    path: Path, space: FeatureSpace, posterior: Posterior, object_ids: tuple[int, ...]
-) -> None:
-    classes = len(object_ids) + 1
+def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMap":
+    """Return the map, if all of its parts fit together."""
+    from vprism_plan.mapping.posterior import VPrismMap
+
+    config = MapConfig(**{**meta["config"], "hinge_shift": tuple(meta["config"]["hinge_shift"])})
+    space = FeatureSpace(tensors["hinges"], config.gamma, float.fromhex(meta["radius"]))
+    posterior = Posterior(
+        tensors["mean"],
+        tensors["covariance"],
+        tensors["precision"],
+        tensors["log_determinant"],
+        tuple(tensors["history"].tolist()),
+    )
+    object_ids = tuple(meta["object_ids"])
+    if not all(is_whole(i) and i > 0 for i in object_ids) or tuple(sorted(set(object_ids))) != (
+        object_ids
+    ):
+        raise MapError(f"object ids are {object_ids}; they must be positive and rise")
+    if not (is_whole(meta["seed"]) and meta["seed"] >= 0):
+        raise MapError(f"seed is {meta['seed']!r}; it must be a whole number from 0")
+    _check_hinges(space, config, posterior)
+    _check_posterior(space, posterior, len(object_ids) + 1)
+    views = _views(tensors, meta["views"])
+    _check_labels(views, object_ids)
+    plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
+    if not all(isinstance(text, str) for text in warnings):
+        raise MapError("warnings must be sentences")
+    return VPrismMap(config, object_ids, plane, views, space, posterior, meta["seed"], warnings)
+
+
+def _check_hinges(space: FeatureSpace, config: MapConfig, posterior: Posterior) -> None:
+    """Refuse hinges that kernels cannot take, or whose pairs the covariances do not hold."""
+    hinges = space.hinges
+    if hinges.dtype != np.float64 or hinges.ndim != 2 or hinges.shape[1] != 3:
+        raise MapError(f"hinges have shape {hinges.shape} and type {hinges.dtype}")
+    if not (np.abs(hinges) <= _FARTHEST).all():
+        raise MapError(f"hinges are not finite, or farther than {_FARTHEST:g} m")
+    if not math.isclose(space.radius, config.cutoff_radius, rel_tol=1e-12):
+        raise MapError(f"radius is {space.radius} m; its kernel has {config.cutoff_radius} m")
+    if len(hinges):
+        # Listing the pairs of hinges that are not these could take any amount of memory.
+        tree = cKDTree(hinges)
+        pairs = (int(tree.count_neighbors(tree, 2.0 * space.radius)) - len(hinges)) // 2
+        if pairs > len(posterior.covariance):
+            raise MapError(
+                f"{len(hinges)} hinges make {pairs} pairs, but there are "
+                f"{len(posterior.covariance)} covariances"
+            )
+
+
+def _check_posterior(space: FeatureSpace, posterior: Posterior, classes: int) -> None:
     expected = {
         "mean": (space.size, classes),
         "covariance": (space.envelope_size, classes),
@@ -135,9 +190,44 @@ def _check_sizes(
         array = getattr(posterior, name)
         if array.shape != shape or array.dtype != np.float64 or not np.isfinite(array).all():
             raise MapError(
-                f"{path} is damaged: {name} has shape {array.shape} and type {array.dtype}, "
-                f"or holds NaN; expected finite float64 {shape}; fit it again"
+                f"{name} has shape {array.shape} and type {array.dtype}, or holds NaN; expected "
+                f"finite float64 {shape}"
             )
+    variance = posterior.covariance[space.diagonal]
+    precision = posterior.precision[space.diagonal]
+    if not ((variance > 0.0).all() and (precision > 0.0).all()):
+        raise MapError("a variance or a precision is not positive")
+    # Of a positive definite matrix and its inverse, diagonals multiply to 1 at least, and
+    # no determinant exceeds the product of its diagonal (Hadamard).
+    bound = np.log(precision).sum(axis=0)
+    if (variance * precision < 1.0 - 1e-6).any() or (
+        posterior.log_determinant > bound + 1e-6 * (1.0 + np.abs(bound))
+    ).any():
+        raise MapError("covariance, precision and log_determinant are not of one posterior")
+    if np.ndim(posterior.history) != 1 or not np.isfinite(posterior.history).all():
+        raise MapError("history is no row of finite numbers")
+
+
+def _views(tensors: Mapping[str, np.ndarray], count: Any) -> tuple[Observation, ...]:
+    """Return all views; there is one at least, and no tensor belongs to nothing."""
+    if not (is_whole(count) and 0 < count <= len(tensors)):
+        raise MapError(f"views is {count!r}; a map is learned from one at least")
+    names = {"hinges", "mean", "covariance", "precision", "log_determinant", "history", "plane"}
+    for index in range(count):
+        names.update(f"view{index}.{part}" for part in (*_VIEW_PARTS, "plane"))
+    stray = sorted(set(tensors) - names)
+    if stray:
+        raise MapError(f"{', '.join(stray)} belong to none of its {count} views")
+    return tuple(_view(tensors, index) for index in range(count))
+
+
+def _check_labels(views: tuple[Observation, ...], object_ids: tuple[int, ...]) -> None:
+    seen = {i for view in views for i in view.object_ids}
+    labelled = {int(i) for view in views for i in np.unique(view.labels)}
+    if not (seen <= set(object_ids) <= labelled):
+        raise MapError(
+            f"it is of the objects {object_ids}, and its views show {tuple(sorted(seen))}"
+        )
 
 
 def _plane_row(plane: Plane) -> np.ndarray:
@@ -145,13 +235,18 @@ def _plane_row(plane: Plane) -> np.ndarray:
 
 
 def _plane(row: np.ndarray) -> Plane:
+    if row.shape != (4,) or not math.isclose(np.linalg.norm(row[:3]), 1.0, abs_tol=1e-9):
+        raise MapError(f"a plane is {row.tolist()}; it must be a unit normal and an offset")
     plane = Plane(row[:3], float(row[3]))
     # The constructor scales to unit length, which may move the last bit of a stored normal.
     plane.__setstate__({"normal": row[:3].copy(), "offset": float(row[3])})
     return plane
 
 
-def _view(tensors: dict[str, np.ndarray], index: int) -> Observation:
+def _view(tensors: Mapping[str, np.ndarray], index: int) -> Observation:
     parts: dict[str, Any] = {part: tensors.get(f"view{index}.{part}") for part in _VIEW_PARTS}
+    for part in _NEEDED_PARTS:
+        if parts[part] is None:
+            raise MapError(f"view {index} has no {part}")
     row = tensors.get(f"view{index}.plane")
     return Observation(**parts, plane=None if row is None else _plane(row))

@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Reading and writing images and JSON so that every failure is one clear line."""
 
-import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from vprism_plan._files import replacing
+from vprism_plan import _files as _shared
 from vprism_plan.errors import ObservationError
 
+MOST_PIXELS = 2**25  # of an image that is read: 33 million
+# PIL has readers for fifty formats, some of which start other programs.
+_IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "PPM", "BMP")
 _DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 _LABEL_MODES = (*_DEPTH_MODES, "L", "P", "1")
 
@@ -20,11 +23,16 @@ def _read_image(path: Path) -> tuple[np.ndarray, str]:
 
     if not path.is_file():
         raise ObservationError(f"{path} is missing")
-    try:
-        with Image.open(path) as image:
-            return np.array(image), image.mode
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ObservationError(f"{path} is not a readable image: {error}") from error
+    with (
+        _shared.reading(path, "a readable image", ObservationError),
+        Image.open(path, formats=_IMAGE_FORMATS) as image,
+    ):
+        if image.width * image.height > MOST_PIXELS:
+            raise ObservationError(
+                f"{path} is an image of {image.width} x {image.height} pixels; at most "
+                f"{MOST_PIXELS:,} are read"
+            )
+        return np.array(image), image.mode
 
 
 def read_depth_image(path: Path) -> np.ndarray:
@@ -61,26 +69,19 @@ def read_color_image(path: Path) -> np.ndarray:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file."""
-    if not path.is_file():
-        raise ObservationError(f"{path} is missing")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ObservationError(f"{path} is not readable JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise ObservationError(f"{path} holds a {type(content).__name__}; it must be an object")
-    return content
+    return _shared.read_json(path, ObservationError)
 
 
 def number(content: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
     """Return a finite number from a JSON object, or name what is missing."""
     if key not in content and default is not None:
         return default
-    value = content.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        found = "is missing" if key not in content else f"is {value!r}"
-        raise ObservationError(f"{path}: {key!r} {found}; it must be a finite number")
-    return float(value)
+    value: Any = content.get(key)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and abs(value) <= sys.float_info.max:  # else float() fails on whole numbers
+        return float(value)
+    found = "is missing" if key not in content else f"is {value!r}"
+    raise ObservationError(f"{path}: {key!r} {found}; it must be a finite number")
 
 
 def positive_number(
@@ -97,7 +98,7 @@ def matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     """Return a float64 array of the given shape from a flat or nested JSON list."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ObservationError(f"{what} is not a matrix of numbers: {error}") from error
     if array.size != int(np.prod(shape)):
         raise ObservationError(
@@ -108,5 +109,5 @@ def matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Write through a temporary file beside `path`, so no half-written file ever remains."""
-    with replacing(path) as temporary, temporary.open("wb") as stream:
+    with _shared.replacing(path) as temporary, temporary.open("wb") as stream:
         write(stream)

@@ -5,13 +5,12 @@ Units become metres here, once: 16-bit depth is multiplied by its scale, BOP's
 millimetres are divided by 1000.
 """
 
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vprism_plan._files import reading
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import _files
 from vprism_plan.perception._bop import load_bop
@@ -27,16 +26,8 @@ _NPZ_KEYS = (
     "plane",
     "robot_spheres",
 )
-# What numpy, zipfile and zlib raise on a damaged archive.
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+# Bytes of all arrays of an archive: the largest image in float64 with labels and color.
+_MOST_UNPACKED = 16 * _files.MOST_PIXELS
 _FORMS = (
     "a .npz file, a folder with depth.png and camera.json, a BOP scene folder with "
     "scene_camera.json, or a depth image named *depth.png with camera.json beside it"
@@ -80,27 +71,35 @@ def load_observation(path: str | Path, *, frame: int | None = None) -> Observati
 
 def _named(source: Path, load: Any) -> Observation:
     """Run a loader; an error about the content gets the path in front."""
-    try:
-        observation: Observation = load()
-    except ObservationError as error:
-        if str(source) in str(error):
-            raise
-        raise ObservationError(f"{source}: {error}") from error
-    return observation
+    with reading(source, "a readable observation", ObservationError):
+        try:
+            observation: Observation = load()
+        except ObservationError as error:
+            if str(source) in str(error):
+                raise
+            raise ObservationError(f"{source}: {error}") from error
+        return observation
 
 
 def _load_npz(path: Path) -> Observation:
-    try:
-        with path.open("rb") as stream:  # numpy leaves a damaged file open
-            archive = np.load(stream, allow_pickle=False)
-            if isinstance(archive, np.ndarray):
-                raise ObservationError(f"{path} is a bare .npy array; save it with np.savez")
-            content = {key: archive[key] for key in _NPZ_KEYS if key in archive.files}
-            found = list(archive.files)
-    except ObservationError:
-        raise
-    except _UNREADABLE as error:
-        raise ObservationError(f"not a readable .npz without pickle: {error}") from error
+    with (
+        reading(path, "a readable .npz without pickle", ObservationError),
+        path.open("rb") as stream,  # numpy leaves a damaged file open
+    ):
+        if stream.read(6) == b"\x93NUMPY":
+            raise ObservationError(f"{path} is a bare .npy array; save it with np.savez")
+        stream.seek(0)
+        archive = np.load(stream, allow_pickle=False)
+        # What a member says it unpacks to is all that is ever unpacked of it.
+        members = [m for m in archive.zip.infolist() if m.filename[:-4] in _NPZ_KEYS]
+        unpacked = sum(member.file_size for member in members)
+        if unpacked > _MOST_UNPACKED:
+            raise ObservationError(
+                f"{path} unpacks to {unpacked:,} bytes; an observation has at most "
+                f"{_MOST_UNPACKED:,}"
+            )
+        content = {key: archive[key] for key in _NPZ_KEYS if key in archive.files}
+        found = list(archive.files)
     for key in ("depth", "intrinsics"):
         if key not in content:
             raise ObservationError(

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vprism_plan._files import write_text
+from vprism_plan._files import read_json, reading, write_text
+from vprism_plan._numbers import is_whole
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.trajectory import Trajectory
 
@@ -69,22 +70,38 @@ def read_trajectory(path_file: str | Path) -> tuple[tuple[str, ...], Trajectory]
     Raises:
         PlanningError: the file is missing or is not such a message.
     """
-    try:
-        message = json.loads(Path(path_file).read_text(encoding="utf-8"))
+    path = Path(path_file)
+    message = read_json(path, PlanningError)
+    with reading(path, "readable as trajectory_msgs/JointTrajectory", PlanningError):
         names = tuple(str(name) for name in message["joint_names"])
         points = message["points"]
-        ticks = [
-            p["time_from_start"]["sec"] * _NANOSECONDS + p["time_from_start"]["nanosec"]
-            for p in points
-        ]
+        ticks = [_ticks(p["time_from_start"]) for p in points]
         rows = (len(points), len(names))
-        return names, Trajectory(
+        trajectory = Trajectory(
             np.array(ticks, dtype=np.float64) / _NANOSECONDS,
             np.array([p["positions"] for p in points], dtype=np.float64).reshape(rows),
             np.array([p["velocities"] for p in points], dtype=np.float64).reshape(rows),
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise PlanningError(
-            f"{path_file} cannot be read as trajectory_msgs/JointTrajectory: "
-            f"{type(error).__name__}: {error}"
-        ) from error
+        wrong = _no_motion(trajectory)
+        if wrong:
+            raise PlanningError(f"{path} is no motion: {wrong}")
+        return names, trajectory
+
+
+def _ticks(time: Any) -> int:
+    parts = time["sec"], time["nanosec"]
+    if not all(is_whole(part) for part in parts):  # a text times a billion fills the memory
+        raise ValueError(f"time_from_start is {time!r}; sec and nanosec must be whole numbers")
+    return int(parts[0] * _NANOSECONDS + parts[1])
+
+
+def _no_motion(trajectory: Trajectory) -> str:
+    """Why these are not times and values of a motion; empty if they are."""
+    values = (trajectory.times, trajectory.positions, trajectory.velocities)
+    if len(trajectory.times) == 0:
+        return "it has no points"
+    if not all(np.isfinite(value).all() for value in values):
+        return "some of its values are not finite"
+    if trajectory.times[0] < 0.0 or not (np.diff(trajectory.times) > 0.0).all():
+        return "its times must rise, from 0 or later"
+    return ""

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._mesh_spheres import read_triangles
+from vprism_plan.robots._mesh_spheres import MOST_BYTES, read_scene, read_triangles
 
 # No link is longer, metres: such a mesh is in millimetres.
 _MAX_EXTENT = 20.0
@@ -68,11 +69,16 @@ class MeshFile:
             RobotError: See :meth:`require`; or the file cannot be read, holds no triangle
                 with an area, or is too large to be in metres.
         """
+        path = self.require()
+        with reading(path, f"a usable mesh of link '{self.link}'", RobotError, MOST_BYTES):
+            return self._local(path)
+
+    def _local(self, path: Path) -> Any:
         import trimesh
 
         what = f"link '{self.link}'"
-        loaded = _loaded(self.require(), what)
-        what = f"{what}, '{self.path}'"
+        loaded = _loaded(path, what)
+        what = f"{what}, '{path}'"
         read_triangles(loaded, what, math.inf)  # before merging, which is for finite vertices
         # Readers keep vertices apart that differ in texture or normal: one point to us.
         local = trimesh.Trimesh(
@@ -97,21 +103,17 @@ class MeshFile:
 
 def _loaded(path: Path, what: str) -> Any:
     """A file as one mesh, in metres where the file states its unit (COLLADA)."""
-    import trimesh
-
-    try:
-        # Processing would cut out vertices that are not finite, and their faces, in silence.
-        scene = trimesh.load_scene(path, process=False)
-        units = scene.units if path.suffix.lower() == ".dae" else None
-        mesh = scene.to_mesh()
-    except Exception as error:  # trimesh's readers raise whatever their format does
-        raise RobotError(f"{what}: '{path}' cannot be read as a mesh: {error}") from error
+    scene = read_scene(path)
+    units = scene.units if path.suffix.lower() == ".dae" else None
+    mesh = scene.to_mesh()
     if len(mesh.faces) == 0:
         raise RobotError(
             f"{what}: '{path}' holds no triangles; give a mesh file with a surface, or spheres= "
             "for the link"
         )
     if units not in (None, "meters"):
+        import trimesh
+
         mesh.apply_scale(trimesh.units.unit_conversion(units, "meters"))
     return mesh
 

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
+from vprism_plan.robots._xml import refuse_growing_scene
 
 _logger = logging.getLogger(__name__)
 # Cells along the longest edge of the mesh's box (the cover's own error is one cell), and
@@ -22,6 +24,35 @@ _CANDIDATES = 1000
 _CHUNK = 20_000
 # Nothing an arm carries is longer, metres: such a mesh is in millimetres.
 _MAX_EXTENT = 5.0
+MOST_BYTES = 2**26  # of a mesh file: 64 MiB, or 1.3 million triangles as STL
+_MOST_TRIANGLES = 10_000_000
+# trimesh also reads archives and formats of its own, which stand for more than they hold.
+_FORMATS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb", ".gltf")
+
+
+def read_scene(path: Path) -> Any:
+    """What a mesh file holds, as a ``trimesh.Scene``; call it inside of `reading`.
+
+    Raises:
+        RobotError: Another format, or more triangles than any link has. Else whatever the
+            format's reader raises.
+    """
+    import trimesh
+
+    format = path.suffix.lower()
+    if format not in _FORMATS:
+        raise RobotError(
+            f"'{path}' is a mesh of format {format!r}; formats that are read: {', '.join(_FORMATS)}"
+        )
+    if format == ".dae":
+        refuse_growing_scene(path)
+    # Processing would cut out vertices that are not finite, and their faces, in silence.
+    scene = trimesh.load_scene(path, process=False)
+    sizes = {name: len(getattr(part, "faces", ())) for name, part in scene.geometry.items()}
+    count = sum(sizes[scene.graph[node][1]] for node in scene.graph.nodes_geometry)
+    if count > _MOST_TRIANGLES:
+        raise RobotError(f"'{path}' has {count:,} triangles; at most {_MOST_TRIANGLES:,} are read")
+    return scene
 
 
 def read_triangles(
@@ -39,17 +70,11 @@ def read_triangles(
             or it is larger than `max_extent`.
     """
     if isinstance(mesh, str | Path):
-        import trimesh
-
         path = Path(mesh)
         if not path.is_file():
             raise RobotError(f"{what}: no mesh file at '{path}'; give an existing file")
-        try:
-            # Processing would cut out vertices that are not finite, and their faces, in silence.
-            mesh = trimesh.load_mesh(path, process=False)
-        except Exception as error:  # trimesh's readers raise whatever their format does
-            raise RobotError(f"{what}: '{path}' cannot be read as a mesh: {error}") from error
-        what = f"{what}, '{path}'"
+        with reading(path, f"a usable mesh of {what}", RobotError, MOST_BYTES):
+            return read_triangles(read_scene(path).to_mesh(), f"{what}, '{path}'", max_extent)
     vertices = np.asarray(getattr(mesh, "vertices", ()), dtype=np.float64)
     faces = np.asarray(getattr(mesh, "faces", ()))
     if len(vertices) == 0 or len(faces) == 0:

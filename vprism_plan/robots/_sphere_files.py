@@ -13,12 +13,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan._files import write_text
+from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
 
 LinkSpheres = dict[str, np.ndarray]
 """Link name -> (n, 4) rows (x, y, z, radius) in the link's frame, metres."""
 
+# A YAML of 80 spheres has 6 kB and 700 values; these take some seconds to read.
+_MOST_BYTES = 2**19
+_MOST_VALUES = 100_000
+_LONGEST_VALUE = 1000  # characters; a number is read in the square of that
 _EXPECTED = "'collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}'"
 
 
@@ -61,11 +65,15 @@ def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
     Raises:
         RobotError: There is no such file, it is none of the above, or a sphere is malformed.
     """
-    if isinstance(spheres, str | Path):
-        path = Path(spheres)
-        source, content, folder = f"'{path}'", _yaml(path), path.parent
-    else:
-        source, content, folder = "spheres", spheres, Path()
+    if not isinstance(spheres, str | Path):
+        return _understood(spheres, "spheres", Path())
+    path = Path(spheres)
+    with reading(path, "a usable file of spheres", RobotError):
+        return _understood(_yaml(path), f"'{path}'", path.parent)
+
+
+def _understood(content: Any, source: str, folder: Path) -> SphereTable:
+    """The table that a file's content is; `folder` is where files that it names are."""
     if isinstance(content, Mapping) and content.get("format") == "xrdf":
         return _from_xrdf(content, source)
     kinematics = content
@@ -91,29 +99,56 @@ def _yaml(path: Path) -> Any:
 
     if not path.is_file():
         raise RobotError(f"no sphere file at '{path}'; give an existing YAML or XRDF file")
-    try:
+    with reading(path, "valid YAML", RobotError, _MOST_BYTES):
         return yaml.load(path.read_text(encoding="utf-8"), Loader=_loader())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise RobotError(f"'{path}' is not valid YAML: {error}") from error
 
 
 @functools.cache
 def _loader() -> Any:
-    """YAML's safe loader, which would keep only the last of several lists for one link."""
+    """YAML's safe loader, with two rules more.
+
+    It would keep only the last of several lists for one link, and a few aliases of aliases
+    stand for more values than any memory holds.
+    """
     import yaml
 
     class Loader(yaml.SafeLoader):
+        def __init__(self, stream: Any) -> None:
+            super().__init__(stream)
+            self._values = 0  # so far, with all that aliases stand for
+            self._sizes: dict[int, int] = {}
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            mark, alias = self.peek_event().start_mark, self.check_event(yaml.AliasEvent)
+            before = self._values
+            node = super().compose_node(parent, index)
+            # What an alias in its own list or mapping stands for has no end.
+            self._values += self._sizes.get(id(node), _MOST_VALUES + 1) if alias else 1
+            problem = None
+            if self._values > _MOST_VALUES:
+                problem = f"with aliases written out it has more than {_MOST_VALUES:,} values"
+            elif isinstance(node, yaml.ScalarNode) and len(node.value) > _LONGEST_VALUE:
+                problem = f"a value of more than {_LONGEST_VALUE:,} characters"
+            if problem is not None:
+                raise yaml.composer.ComposerError(problem=problem, problem_mark=mark)
+            if not alias:
+                self._sizes[id(node)] = self._values - before
+            return node
+
         def compose_mapping_node(self, anchor: Any) -> Any:
             node = super().compose_mapping_node(anchor)
             seen = set()
             for key, _ in node.value:
-                name = str(key.value)
-                if name in seen:
+                if not isinstance(key, yaml.ScalarNode):
                     raise yaml.constructor.ConstructorError(
-                        problem=f"the key '{name}' occurs twice; join the two",
+                        problem="a key is no plain name", problem_mark=key.start_mark
+                    )
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        problem=f"the key '{key.value}' occurs twice; join the two",
                         problem_mark=key.start_mark,
                     )
-                seen.add(name)
+                seen.add(key.value)
             return node
 
     return Loader

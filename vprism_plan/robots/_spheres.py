@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._geometry import PrimitiveGeometry
@@ -199,10 +199,11 @@ def _tile_cylinder(radius: float, length: float) -> Float[np.ndarray, "n 4"]:
         rings = math.ceil(radius / edge)
         # A slender cylinder gains nothing from slices much thinner than it is wide.
         slices = math.ceil(length / max(0.5 * edge, min(edge, radius)))
-        disc = _tile_disc(radius, rings, edge)
-        if len(disc) * slices <= _MAX_TILES or len(disc) == slices == 1:
+        count = 1 + int(_sectors(radius, rings, edge).sum())
+        if count * slices <= _MAX_TILES or count == slices == 1:
             break
         edge *= 1.1
+    disc = _tile_disc(radius, rings, edge)
     step = length / slices
     heights = (np.arange(slices) + 0.5) * step - 0.5 * length
     rows = np.empty((slices, len(disc), 4))
@@ -212,13 +213,18 @@ def _tile_cylinder(radius: float, length: float) -> Float[np.ndarray, "n 4"]:
     return rows.reshape(-1, 4)
 
 
+def _sectors(radius: float, rings: int, edge: float) -> Int[np.ndarray, "rings"]:
+    """Into how many sectors each ring of a disc but the innermost is cut."""
+    outer = np.arange(2, rings + 1) * (radius / rings)
+    return np.maximum(4, np.ceil(2 * math.pi * outer / edge)).astype(np.int64)
+
+
 def _tile_disc(radius: float, rings: int, edge: float) -> Float[np.ndarray, "n 3"]:
     """Circles (x, y, radius) whose union holds a disc."""
     width = radius / rings
     circles = [np.array([[0.0, 0.0, width]])]
-    for ring in range(1, rings):
+    for ring, n in enumerate(_sectors(radius, rings, edge).tolist(), start=1):
         inner, outer = ring * width, (ring + 1) * width
-        n = max(4, math.ceil(2 * math.pi * outer / edge))
         half = math.pi / n
         # Equally far from the sector's inner and outer corners.
         middle = (inner + outer) / (2 * math.cos(half))

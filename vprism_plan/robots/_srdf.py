@@ -8,8 +8,10 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._model import RobotModel
+from vprism_plan.robots._xml import robot_element
 
 
 @dataclass(frozen=True)
@@ -56,14 +58,11 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     path = Path(path)
     if not path.is_file():
         raise RobotError(f"no SRDF file at '{path}'; give an existing file, or leave srdf=None")
-    try:
-        root = ET.fromstring(path.read_bytes())
-    except ET.ParseError as error:
-        raise RobotError(f"'{path}' is not well-formed XML: {error}") from error
-    if root.tag != "robot":
-        raise RobotError(f"the root element of '{path}' is <{root.tag}>, an SRDF has <robot>")
-    groups, links = _groups(root, model, path)
-    return SemanticModel(groups, links, _states(root, model, path), _disabled(root, model, path))
+    with reading(path, "a usable SRDF", RobotError):
+        root = robot_element(path, "an SRDF")
+        groups, links = _groups(root, model, path)
+        states, disabled = _states(root, model, path), _disabled(root, model, path)
+        return SemanticModel(groups, links, states, disabled)
 
 
 def _groups(

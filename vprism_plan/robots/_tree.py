@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter, deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,12 +43,16 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
     if len(roots) != 1:
         what = f"several roots {roots}" if roots else "no root: its joints form a cycle"
         raise RobotError(f"'{path}' has {what}; a URDF has exactly one link without a parent")
-    ordered, queue = [], [roots[0]]
+    children: dict[str, list[Joint]] = {}
+    for joint in joints:
+        children.setdefault(joint.parent, []).append(joint)
+    ordered: list[Joint] = []
+    queue = deque([roots[0]])
     while queue:
-        link = queue.pop(0)
-        below = [joint for joint in joints if joint.parent == link]
+        link = queue.popleft()
+        below = children.get(link, [])
         ordered += below
-        queue += [joint.child for joint in below]
+        queue.extend(joint.child for joint in below)
     if len(ordered) != len(joints):
         lost = sorted(set(joint_map) - {joint.name for joint in ordered})
         raise RobotError(f"joints {lost} in '{path}' form a cycle; a URDF is a tree")
@@ -60,7 +65,7 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
 
 
 def _refuse_duplicates(names: list[str], what: str, path: Path) -> None:
-    duplicates = sorted({name for name in names if names.count(name) > 1})
+    duplicates = sorted(name for name, count in Counter(names).items() if count > 1)
     if duplicates:
         raise RobotError(f"{what} names {duplicates} occur more than once in '{path}'")
 

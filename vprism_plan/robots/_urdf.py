@@ -16,13 +16,18 @@ from typing import Any
 
 import numpy as np
 
+from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
 from vprism_plan.robots._geometry import PrimitiveGeometry
 from vprism_plan.robots._mesh_files import MeshFile, PackageDirs, find_mesh
 from vprism_plan.robots._model import MOVING_TYPES, Joint, Link, RobotModel
 from vprism_plan.robots._tree import build_tree
+from vprism_plan.robots._xml import robot_element
 
 _FARTHEST_LIMIT = 1e4  # radians or metres; SDF writes 1e16 for "none"
+_SMALLEST, _LARGEST = 1e-6, 1e3  # metres of a solid, which is cut into tiles
+# Tables of a robot grow with the square of its links; PR2 has 90.
+_MOST_LINKS = 1000
 _ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
 
 
@@ -43,21 +48,14 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
         raise RobotError(f"no URDF file at '{path}'; give the path of an existing .urdf file")
     import yourdfpy
 
-    cleaned = _clean_xml(path)
-    try:
+    with reading(path, "a usable URDF (check_urdf may say more)", RobotError):
+        cleaned = _clean_xml(path)
         urdf = yourdfpy.URDF.load(
             io.BytesIO(cleaned), build_scene_graph=False, load_meshes=False
         ).robot
         links = [_link(element, path, package_dirs) for element in urdf.links]
         joints = [_joint(element, path) for element in urdf.joints]
-    except RobotError:
-        raise
-    except (ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
-        raise RobotError(
-            f"'{path}' is not a usable URDF: {type(error).__name__}: {error}; "
-            "check the file with check_urdf"
-        ) from error
-    return build_tree(str(urdf.name), links, joints, path)
+        return build_tree(str(urdf.name), links, joints, path)
 
 
 def _clean_xml(path: Path) -> bytes:
@@ -66,14 +64,12 @@ def _clean_xml(path: Path) -> bytes:
     Visuals, inertias, transmissions and simulator tags are dropped: they vary
     most between files and a mistake in them must not stop a planner.
     """
-    try:
-        root = ET.fromstring(path.read_bytes())
-    except ET.ParseError as error:
-        raise RobotError(f"'{path}' is not well-formed XML: {error}") from error
-    if root.tag != "robot":
-        raise RobotError(f"the root element of '{path}' is <{root.tag}>, a URDF has <robot>")
+    root = robot_element(path, "a URDF")
     if any("xacro" in element.tag for element in root.iter()):
         raise RobotError(f"'{path}' holds xacro macros; expand it first: xacro IN > OUT.urdf")
+    count = len(root.findall("link"))
+    if count > _MOST_LINKS:
+        raise RobotError(f"'{path}' has {count:,} links; at most {_MOST_LINKS:,} are read")
     kept = ET.Element("robot", {"name": root.get("name", path.stem)})
     for link in root.findall("link"):
         _require(link, "name", path)
@@ -147,10 +143,10 @@ def _primitive(link: str, geometry: Any, T: np.ndarray, path: Path) -> Primitive
     else:
         kind, size = "sphere", (geometry.sphere.radius,)
     expected = {"box": 3, "cylinder": 2, "sphere": 1}[kind]
-    if len(size) != expected or not all(math.isfinite(v) and v > 0 for v in size):
+    if len(size) != expected or not all(_SMALLEST <= v <= _LARGEST for v in size):
         raise RobotError(
             f"link '{link}' in '{path}' has a {kind} of size {size}; "
-            "sizes must be positive and finite"
+            f"sizes must be positive and finite, from {_SMALLEST:g} to {_LARGEST:g} m"
         )
     return PrimitiveGeometry(kind, size, T)
 

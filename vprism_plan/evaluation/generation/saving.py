@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from vprism_plan._files import write_text
+from vprism_plan._files import read_json, reading, write_text
 from vprism_plan.errors import ObservationError
 from vprism_plan.evaluation.camera import Camera, DepthNoise
 from vprism_plan.evaluation.generation.raycasting import DEPTH_UNIT, metres
@@ -75,10 +75,8 @@ def load_scene(path: str | Path) -> MeshScene:
     """
     folder = Path(path)
     data = _read_truth(folder)
-    try:
+    with reading(folder / GROUND_TRUTH, "whole", ObservationError):
         return _assembled(folder, data)
-    except (KeyError, TypeError) as error:
-        raise ObservationError(f"{folder / GROUND_TRUTH} is not whole: {error!r}") from error
 
 
 def _assembled(folder: Path, data: dict[str, Any]) -> MeshScene:
@@ -194,10 +192,7 @@ def _read_truth(folder: Path) -> dict[str, Any]:
     truth = folder / GROUND_TRUTH
     if not truth.is_file():
         raise ObservationError(f"{truth} does not exist; a mesh scene is written by its save()")
-    try:
-        data: dict[str, Any] = json.loads(truth.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ObservationError(f"{truth} is not readable JSON: {error}") from error
+    data = read_json(truth, ObservationError)
     if data.get("format") != _FORMAT:
         raise ObservationError(
             f"{truth} has format {data.get('format')!r}; this version reads {_FORMAT!r}"

@@ -6,10 +6,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 
-from vprism_plan._files import replacing
+from vprism_plan._files import reading, replacing
 from vprism_plan.errors import MapError
 from vprism_plan.evaluation.baselines.pointsdf.model import Architecture, PointSDF
 
@@ -48,23 +48,21 @@ def load_network(path: str | Path = SHIPPED) -> tuple[PointSDF, dict[str, Any]]:
             f"no PointSDF weights at {path}; install the package again, or train them: "
             "python benchmarks/train_pointsdf.py"
         )
-    try:
+    with reading(path, "a safetensors file of weights, or damaged", MapError):
         with safe_open(path, framework="pt") as file:
             header = json.loads((file.metadata() or {}).get(_HEADER, "{}"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, ValueError) as error:
-        raise MapError(f"{path} is no safetensors file, or damaged: {error}") from error
-    if header.get("version") != FORMAT_VERSION:
-        raise MapError(
-            f"{path} holds no PointSDF weights of version {FORMAT_VERSION} (version: "
-            f"{header.get('version')!r}); train them again: python benchmarks/train_pointsdf.py"
-        )
-    model = PointSDF(Architecture.from_dict(header["architecture"]))
-    try:
-        model.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise MapError(f"{path} does not fit its own architecture: {error}") from error
-    return model.requires_grad_(False).eval(), header["history"]
+        if header.get("version") != FORMAT_VERSION:
+            raise MapError(
+                f"{path} holds no PointSDF weights of version {FORMAT_VERSION} (version: "
+                f"{header.get('version')!r}); train them again: python benchmarks/train_pointsdf.py"
+            )
+        model = PointSDF(Architecture.from_dict(header["architecture"]))
+        try:
+            model.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise MapError(f"{path} does not fit its own architecture: {error}") from error
+        return model.requires_grad_(False).eval(), header["history"]
 
 
 @lru_cache(maxsize=1)
