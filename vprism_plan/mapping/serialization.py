@@ -20,7 +20,7 @@ from vprism_plan.errors import MapError, VPrismError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior
 from vprism_plan.mapping.features import FeatureSpace
-from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.observation import DEFAULT_MAX_RANGE, Observation
 from vprism_plan.perception.plane import Plane
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "object_ids": list(fitted.object_ids),
         "seed": fitted.seed,
         "views": len(fitted.views),
+        "max_range": [view.max_range for view in fitted.views],
         "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
     }
@@ -97,7 +98,9 @@ def load_map(path: str | Path) -> "VPrismMap":
         )
         object_ids = tuple(int(i) for i in meta["object_ids"])
         _check_sizes(path, space, posterior, object_ids)
-        views = tuple(_view(tensors, index) for index in range(int(meta["views"])))
+        count = int(meta["views"])
+        ranges = meta.get("max_range", [None] * count)
+        views = tuple(_view(tensors, i, r) for i, r in zip(range(count), ranges, strict=True))
         plane = _plane(tensors["plane"])
         warnings = tuple(str(text) for text in meta.get("warnings", ()))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -151,7 +154,9 @@ def _plane(row: np.ndarray) -> Plane:
     return plane
 
 
-def _view(tensors: dict[str, np.ndarray], index: int) -> Observation:
+def _view(tensors: dict[str, np.ndarray], index: int, max_range: float | None) -> Observation:
     parts: dict[str, Any] = {part: tensors.get(f"view{index}.{part}") for part in _VIEW_PARTS}
     row = tensors.get(f"view{index}.plane")
-    return Observation(**parts, plane=None if row is None else _plane(row))
+    if max_range is None:  # a file older than the limit: the map was learned from all it holds
+        max_range = max(DEFAULT_MAX_RANGE, float(parts["depth"].max()))
+    return Observation(**parts, plane=None if row is None else _plane(row), max_range=max_range)
