@@ -63,6 +63,24 @@ def test_views_and_plane_come_along(small_map, saved):
                 np.testing.assert_array_equal(a, b)
 
 
+def test_far_depth_of_a_view_is_kept(small_map, saved, tmp_path):
+    far = small_map.views[0].depth.copy()
+    far[:2] = 15.0
+    changed = {"view0.depth": far}
+    read = load_map(rewrite(saved, tmp_path / "far.safetensors", {"max_range": [20.0]}, **changed))
+    read.save(tmp_path / "again.safetensors")
+    (new,) = load_map(tmp_path / "again.safetensors").views
+    assert new.max_range == 20.0
+    np.testing.assert_array_equal(new.depth, far)
+    # A file from before the limit knows none: the map was learned from all that it holds.
+    old = rewrite(
+        saved, tmp_path / "old.safetensors", {"max_range": [None]}, **{"view0.depth": far}
+    )
+    np.testing.assert_array_equal(load_map(old).views[0].depth, far)
+    with pytest.raises(MapError, match="damaged"):
+        load_map(rewrite(saved, tmp_path / "bad.safetensors", {"max_range": [10.0, 10.0]}))
+
+
 def test_a_loaded_map_can_be_updated(saved, small_map, second_view, query):
     np.testing.assert_array_equal(
         load_map(saved).update(second_view).occupancy(query),

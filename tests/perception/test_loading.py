@@ -86,6 +86,7 @@ def assert_same(a: Observation, b: Observation, depth_tolerance: float = 0.0) ->
     np.testing.assert_allclose(a.depth, b.depth, atol=depth_tolerance, rtol=0)
     for name in ("labels", "intrinsics", "T_world_camera", "color"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert a.max_range == b.max_range
     if b.plane is None:
         assert a.plane is None
     else:
@@ -103,10 +104,19 @@ def test_npz_round_trip_is_exact(obs, tmp_path, dtype):
     assert [p.name for p in tmp_path.iterdir()] == ["view.npz"]
 
 
+@pytest.mark.parametrize("name", ["view.npz", "view"])
+def test_the_range_is_kept(obs, tmp_path, name):
+    far = replace(obs, depth=np.round(obs.depth * 5, 3), max_range=20.0)
+    assert far.depth.max() > 10.0
+    save_observation(far, tmp_path / name)
+    assert_same(load_observation(tmp_path / name), far, 0.5001e-3)
+
+
 def test_folder_round_trip_keeps_a_tenth_of_a_millimetre(obs, tmp_path):
     save_observation(obs, tmp_path / "view")
     assert_same(load_observation(str(tmp_path / "view")), obs, 0.5001e-4)
-    far = replace(obs, depth=obs.depth * 10)
+    far = replace(obs, depth=obs.depth * 10, max_range=50.0)
+    assert far.depth.max() > 10.0
     save_observation(far, tmp_path / "view")
     assert_same(load_observation(tmp_path / "view"), far, 0.5001e-3)
 
@@ -158,6 +168,19 @@ def test_folder_in_metres(folder):
     assert not obs.posed
 
 
+@pytest.mark.parametrize("dtype", [np.uint16, np.int32])
+def test_the_largest_raw_value_is_no_return(folder, dtype):
+    raw = raw_depth()
+    raw[3:6, 4:9] = 65535
+    if dtype is np.uint16:
+        write(folder / "depth.png", raw)
+    else:  # 16 bits that arrive as 32
+        Image.fromarray(raw.astype(dtype)).save(folder / "depth.png", format="TIFF")
+    obs = load_observation(folder)
+    np.testing.assert_allclose(obs.depth, np.where(raw == 65535, 0, raw) * 0.001)
+    assert obs.warnings == ()
+
+
 def test_depth_image_with_siblings(folder):
     write(folder / "frame0-depth.png", raw_depth())
     write(folder / "frame0-color.png", np.full((*SHAPE, 3), 7, np.uint8))
@@ -172,6 +195,11 @@ def test_bop_scene_in_metres(scene):
     first = load_observation(scene)
     np.testing.assert_allclose(first.depth, (raw_depth() + 3) * 1e-4)
     assert first.object_ids == ()
+    blind = raw_depth()
+    blind[4, 5] = 65535
+    write(scene / "depth" / "000003.png", blind)
+    assert load_observation(scene).depth[4, 5] == 0.0
+    assert load_observation(scene).warnings == ()
     assert first.color is None
     obs = load_observation(scene, frame=7)
     assert obs.object_ids == (1, 3)
@@ -303,9 +331,13 @@ def test_faulty_npz(tmp_path):
     np.savez(path, depth=np.array([None]), intrinsics=K)
     with pytest.raises(ObservationError, match="without pickle"):
         load_observation(path)
-    np.savez(path, depth=np.full((12, 16), np.nan), intrinsics=K)
-    with pytest.raises(ObservationError, match="depth is nan"):
+    np.savez(path, depth=np.full((12, 16), -np.inf), intrinsics=K)
+    with pytest.raises(ObservationError, match="depth is -inf"):
         load_observation(path)
+    for wrong in (np.ones(2), 0.0, "far"):
+        np.savez(path, depth=np.ones((12, 16)), intrinsics=K, max_range=wrong)
+        with pytest.raises(ObservationError, match="max_range"):
+            load_observation(path)
     with path.open("wb") as stream:
         np.save(stream, np.ones(3))
     with pytest.raises(ObservationError, match="bare"):
@@ -334,7 +366,7 @@ def test_what_cannot_be_saved_is_explained(obs, tmp_path):
     with pytest.raises(ObservationError, match="cannot be written"):
         save_observation(obs, tmp_path / "taken")
     with pytest.raises(ObservationError, match="16 bits of millimetres"):
-        save_observation(replace(obs, depth=obs.depth * 25), tmp_path / "far")
+        save_observation(replace(obs, depth=obs.depth * 25, max_range=100.0), tmp_path / "far")
     tiny = obs.depth.copy()
     tiny[5, 5] = 1e-6
     with pytest.raises(ObservationError, match="no return"):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What an observation accepts, what it refuses, and how it says so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -98,12 +100,24 @@ BAD_DEPTH = {
     "shape": (np.ones((6, 8, 1)), r"\(6, 8, 1\)"),
     "empty": (np.ones((0, 8)), r"\(0, 8\)"),
     "raw": (np.ones((6, 8), np.uint16), "uint16.*metres"),
-    "nan": (with_value(depth(), (2, 3), np.nan), "row 2, column 3"),
-    "inf": (with_value(depth(), (2, 3), np.inf), "inf at row 2"),
+    "minus inf": (with_value(depth(), (2, 3), -np.inf), r"-inf at row 2, column 3 \(1 neg"),
+    "minus inf, made finite": (
+        np.nan_to_num(with_value(depth(), (2, 3), -np.inf).astype(np.float32)),
+        "-inf at row 2.*neginf=0",
+    ),
     "negative": (with_value(depth(), (5, 7), -0.5), "-0.5 at row 5, column 7"),
     "millimetres": (depth(700.0), "millimetres"),
     "scaled twice": (depth(0.0007), "scaled twice"),
-    "nothing": (depth(0.0), "0 everywhere"),
+    "millimetres, half of them without": (
+        with_value(depth(700.0), np.s_[:, :5], 65535.0),
+        "millimetres",
+    ),
+    "nothing": (depth(0.0), "0, NaN or infinite everywhere"),
+    "nothing, in words": (depth(np.nan), "0, NaN or infinite everywhere"),
+    "too far": (
+        depth(12.5),
+        "every depth return lies beyond max_range = 10 m, the nearest at 12.5",
+    ),
     "complex": (depth().astype(complex), "complex128"),
     "object": (np.array([[None]]), "Python objects"),
     "ragged": ([[1.0], [1.0, 2.0]], "not an array"),
@@ -115,6 +129,39 @@ def test_bad_depth_is_named(name):
     value, message = BAD_DEPTH[name]
     with pytest.raises(ObservationError, match=message):
         Observation(value, None, K)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("value", [np.nan, np.inf, np.nan_to_num(np.float32(np.inf))])
+def test_what_stands_for_no_return_becomes_zero_without_a_word(value, dtype):
+    obs = Observation(with_value(depth(), (2, 3), value).astype(dtype), None, K)
+    assert obs.depth[2, 3] == 0.0
+    assert (obs.depth > 0).sum() == 47
+    assert obs.warnings == ()
+
+
+@pytest.mark.parametrize("pixels", [np.s_[2, 3], np.s_[:, :7]])  # one, and most of the image
+def test_depth_beyond_the_sensors_range_becomes_no_return_and_is_named(pixels):
+    image = with_value(depth(), pixels, 65.535)
+    obs = Observation(image, None, K)
+    count = int((image > 10).sum())
+    np.testing.assert_array_equal(obs.depth, np.where(image > 10, 0.0, image))
+    (warning,) = obs.warnings
+    assert f"{count} depth returns" in warning
+    assert "max_range = 10 m, the farthest at 65.53 m" in warning
+    # What was mended once is not named again, and what is real may be kept.
+    assert replace(obs, labels=np.ones((6, 8), int)).warnings == (warning,)
+    kept = Observation(image, None, K, max_range=70.0)
+    np.testing.assert_array_equal(kept.depth, image)
+    assert kept.warnings == ()
+    nearer = Observation(with_value(depth(), (2, 3), 2.0), None, K, max_range=1.5)
+    assert nearer.depth[2, 3] == 0.0
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_bad_max_range_is_named(value):
+    with pytest.raises(ObservationError, match="max_range is"):
+        Observation(depth(), None, K, max_range=value)
 
 
 BAD_LABELS = {

@@ -65,6 +65,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "object_ids": list(fitted.object_ids),
         "seed": fitted.seed,
         "views": len(fitted.views),
+        "max_range": [view.max_range for view in fitted.views],
         "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
     }
@@ -151,7 +152,7 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
         raise MapError(f"seed is {meta['seed']!r}; it must be a whole number from 0")
     _check_hinges(space, config, posterior)
     _check_posterior(space, posterior, len(object_ids) + 1)
-    views = _views(tensors, meta["views"])
+    views = _views(tensors, meta["views"], meta["max_range"])
     _check_labels(views, object_ids)
     plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
     if not all(isinstance(text, str) for text in warnings):
@@ -208,7 +209,9 @@ def _check_posterior(space: FeatureSpace, posterior: Posterior, classes: int) ->
         raise MapError("history is no row of finite numbers")
 
 
-def _views(tensors: Mapping[str, np.ndarray], count: Any) -> tuple[Observation, ...]:
+def _views(
+    tensors: Mapping[str, np.ndarray], count: Any, ranges: list[float]
+) -> tuple[Observation, ...]:
     """Return all views; there is one at least, and no tensor belongs to nothing."""
     if not (is_whole(count) and 0 < count <= len(tensors)):
         raise MapError(f"views is {count!r}; a map is learned from one at least")
@@ -218,7 +221,7 @@ def _views(tensors: Mapping[str, np.ndarray], count: Any) -> tuple[Observation, 
     stray = sorted(set(tensors) - names)
     if stray:
         raise MapError(f"{', '.join(stray)} belong to none of its {count} views")
-    return tuple(_view(tensors, index) for index in range(count))
+    return tuple(_view(tensors, i, most) for i, most in zip(range(count), ranges, strict=True))
 
 
 def _check_labels(views: tuple[Observation, ...], object_ids: tuple[int, ...]) -> None:
@@ -243,10 +246,10 @@ def _plane(row: np.ndarray) -> Plane:
     return plane
 
 
-def _view(tensors: Mapping[str, np.ndarray], index: int) -> Observation:
+def _view(tensors: Mapping[str, np.ndarray], index: int, max_range: float) -> Observation:
     parts: dict[str, Any] = {part: tensors.get(f"view{index}.{part}") for part in _VIEW_PARTS}
     for part in _NEEDED_PARTS:
         if parts[part] is None:
             raise MapError(f"view {index} has no {part}")
     row = tensors.get(f"view{index}.plane")
-    return Observation(**parts, plane=None if row is None else _plane(row))
+    return Observation(**parts, plane=None if row is None else _plane(row), max_range=max_range)

@@ -15,6 +15,7 @@ MOST_PIXELS = 2**25  # of an image that is read: 33 million
 # PIL has readers for fifty formats, some of which start other programs.
 _IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "PPM", "BMP")
 _DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I")
+_UINT16_MAX = 65535
 _LABEL_MODES = (*_DEPTH_MODES, "L", "P", "1")
 
 
@@ -36,14 +37,20 @@ def _read_image(path: Path) -> tuple[np.ndarray, str]:
 
 
 def read_depth_image(path: Path) -> np.ndarray:
-    """Return raw sensor units (H, W) of a 16-bit single-channel image."""
+    """Return raw sensor units (H, W) of a 16-bit single-channel image, 0 = no return.
+
+    The largest value that the pixel type holds means "no data" and becomes 0.
+    """
     raw, mode = _read_image(path)
     if mode not in _DEPTH_MODES:
         raise ObservationError(
             f"{path} has pixel format {mode}; depth must be a 16-bit single-channel PNG (an "
             "8-bit image has lost the metric depth: export the raw one)"
         )
-    return raw
+    largest = np.iinfo(raw.dtype).max
+    if raw.max() == _UINT16_MAX:  # 16 bits may arrive in a wider type
+        largest = _UINT16_MAX
+    return np.where(raw == largest, 0, raw).astype(raw.dtype)
 
 
 def read_label_image(path: Path) -> np.ndarray:

@@ -11,6 +11,10 @@ from vprism_plan.errors import ObservationError
 MAX_MEDIAN_DEPTH = 50.0
 # No depth sensor measures this near: a median below it means depth was scaled twice.
 MIN_MEDIAN_DEPTH = 0.005
+# With fewer returns within the sensor's range than this share, the unit is wrong, not the rest.
+_USABLE_SHARE = 0.05
+# What np.nan_to_num writes for infinity in single precision; no depth is as large.
+_INFINITE = float(np.finfo(np.float32).max)
 _RIGID_TOLERANCE = 1e-3
 
 
@@ -29,8 +33,20 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
     return array
 
 
-def check_depth(value: Any) -> np.ndarray:
-    """Return depth as a (H, W) float32 or float64 array in metres, 0 = no return."""
+def check_max_range(value: Any) -> float:
+    """Return the farthest depth that counts as a return, metres."""
+    is_number = isinstance(value, int | float | np.integer | np.floating)
+    if not is_number or isinstance(value, bool) or not (np.isfinite(value) and value > 0):
+        raise ObservationError(f"max_range is {value!r}; it must be a positive number of metres")
+    return float(value)
+
+
+def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return depth as a (H, W) float32 or float64 array in metres, 0 = no return.
+
+    NaN, infinity and what lies beyond `max_range` (metres) are no returns; the latter, which a
+    sensor or a driver made up, is named in the second value.
+    """
     depth = to_numpy(value, "depth")
     if depth.ndim != 2 or 0 in depth.shape:
         raise ObservationError(f"depth has shape {depth.shape}; it must be one image (H, W)")
@@ -43,33 +59,57 @@ def check_depth(value: Any) -> np.ndarray:
         if depth.dtype.kind != "f":
             raise ObservationError(f"depth is {depth.dtype}; it must be float32 or float64 metres")
         depth = depth.astype(np.float32 if depth.dtype.itemsize <= 4 else np.float64)
-    _check_depth_values(depth)
-    return np.ascontiguousarray(depth)
-
-
-def _check_depth_values(depth: np.ndarray) -> None:
-    bad = ~np.isfinite(depth)
-    if bad.any():
-        row, col = np.argwhere(bad)[0]
-        raise ObservationError(
-            f"depth is {depth[row, col]} at row {row}, column {col} ({int(bad.sum())} such "
-            "pixels); mark pixels without a return as 0: np.nan_to_num(depth, posinf=0)"
-        )
-    if (depth < 0).any():
-        row, col = np.argwhere(depth < 0)[0]
-        raise ObservationError(
-            f"depth is {depth[row, col]:g} at row {row}, column {col}; it must be positive "
-            "metres along the optical axis, or 0 where there is no return"
-        )
+    _check_signs(depth)
+    depth[~(depth < _INFINITE)] = 0.0  # NaN compares false
     valid = depth[depth > 0]
+    _check_scale(valid, max_range)
+    beyond = depth > max_range
+    if not beyond.any():
+        return np.ascontiguousarray(depth), ()
+    found = (
+        f"{int(beyond.sum())} depth returns ({100 * beyond.sum() / valid.size:.2g} %) lie beyond "
+        f"max_range = {max_range:g} m, the farthest at {valid.max():.4g} m; they count as no "
+        "return: is it the sensor's value for 'no data'? If they are real, raise max_range"
+    )
+    depth[beyond] = 0.0
+    return np.ascontiguousarray(depth), (found,)
+
+
+def _check_signs(depth: np.ndarray) -> None:
+    bad = depth < 0
+    if not bad.any():
+        return
+    row, col = np.argwhere(bad)[0]
+    infinite = depth[row, col] <= -_INFINITE
+    raise ObservationError(
+        f"depth is {'-inf' if infinite else format(depth[row, col], 'g')} at row {row}, column "
+        f"{col} ({int(bad.sum())} negative pixels); it must be positive metres along the optical "
+        "axis, or 0 where there is no return"
+        + ("; np.nan_to_num(depth, posinf=0, neginf=0) says so" if infinite else "")
+    )
+
+
+def _check_scale(valid: np.ndarray, max_range: float) -> None:
+    """Refuse returns (metres, all positive) that are in other units."""
     if valid.size == 0:
-        raise ObservationError("depth is 0 everywhere: the sensor returned nothing to map")
-    median = float(np.median(valid))
-    if median > MAX_MEDIAN_DEPTH:
+        raise ObservationError(
+            "depth is 0, NaN or infinite everywhere: the sensor returned nothing to map"
+        )
+    usable = valid[valid <= max_range]
+    # A value for "no data" may be in most pixels; it is the largest there is.
+    body = valid[valid < valid.max()]
+    median = float(np.median(body if body.size else valid))
+    if median > MAX_MEDIAN_DEPTH and usable.size < _USABLE_SHARE * valid.size:
         raise ObservationError(
             f"median depth is {median:g} m, more than {MAX_MEDIAN_DEPTH:g} m: it looks like "
             "millimetres; multiply by 0.001"
         )
+    if usable.size == 0:
+        raise ObservationError(
+            f"every depth return lies beyond max_range = {max_range:g} m, the nearest at "
+            f"{valid.min():g} m: is depth in metres? If it is, raise max_range"
+        )
+    median = float(np.median(usable))
     if median < MIN_MEDIAN_DEPTH:
         raise ObservationError(
             f"median depth is {median:g} m, less than {MIN_MEDIAN_DEPTH:g} m: it looks as if "

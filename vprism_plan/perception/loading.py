@@ -14,7 +14,7 @@ from vprism_plan._files import reading
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import _files
 from vprism_plan.perception._bop import load_bop
-from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.observation import DEFAULT_MAX_RANGE, Observation
 from vprism_plan.perception.plane import Plane
 
 _NPZ_KEYS = (
@@ -25,6 +25,7 @@ _NPZ_KEYS = (
     "color",
     "plane",
     "robot_spheres",
+    "max_range",
 )
 # Bytes of all arrays of an archive: the largest image in float64 with labels and color.
 _MOST_UNPACKED = 16 * _files.MOST_PIXELS
@@ -39,15 +40,17 @@ def load_observation(path: str | Path, *, frame: int | None = None) -> Observati
 
     - `.npz` (read without pickle): `depth` (metres, float) and `intrinsics` (3x3);
       optional `labels`, `T_world_camera`, `color`, `plane` (normal and offset),
-      `robot_spheres` (rows x, y, z, radius; camera frame).
+      `robot_spheres` (rows x, y, z, radius; camera frame), `max_range` (metres).
     - a folder: `depth.png` (16-bit), `camera.json` with `fx fy cx cy` (pixels) and
-      `depth_scale` (metres per raw unit), optional `T_world_camera` (4x4), `plane`
-      and `robot_spheres`; optional `labels.png` and `color.png`.
+      `depth_scale` (metres per raw unit), optional `T_world_camera` (4x4), `plane`,
+      `robot_spheres` and `max_range`; optional `labels.png` and `color.png`.
     - a BOP scene folder (`scene_camera.json`, `depth/`, millimetres): `frame` picks the
       image, default the first; labels are the ground-truth index + 1 from
       `mask_visib/`, the pose comes from `cam_R_w2c`, `cam_t_w2c` where present.
     - a depth image `X-depth.png`: `camera.json` beside it, and optional `X-color.png`,
       `X-labels.png`.
+
+    Raw depth that is the largest its pixel type holds (65535) is no return.
 
     Raises:
         ObservationError: one line that names the file, what is wrong and what is valid.
@@ -114,6 +117,9 @@ def _load_npz(path: Path) -> Observation:
         content.get("color"),
         _plane(content.get("plane"), "plane"),
         content.get("robot_spheres"),
+        max_range=float(
+            _files.matrix(content.get("max_range", DEFAULT_MAX_RANGE), (), "max_range")
+        ),
     )
 
 
@@ -165,4 +171,5 @@ def _assemble(depth: Path, camera: Path, labels: Path, color: Path) -> Observati
         _files.read_color_image(color) if color.is_file() else None,
         _plane(content.get("plane"), f"{camera}: 'plane'"),
         content.get("robot_spheres"),
+        max_range=_files.positive_number(content, "max_range", camera, default=DEFAULT_MAX_RANGE),
     )

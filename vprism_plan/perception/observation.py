@@ -13,6 +13,9 @@ from vprism_plan.perception import _validation
 from vprism_plan.perception.camera import backproject, ball_window, point_image
 from vprism_plan.perception.plane import Plane
 
+# Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.
+DEFAULT_MAX_RANGE = 10.0
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
@@ -22,7 +25,8 @@ class Observation:
     that reuses its buffers cannot change an observation.
 
     Attributes:
-        depth: (H, W) float32 or float64, metres along the optical axis, 0 = no return.
+        depth: (H, W) float32 or float64, metres along the optical axis (not along the ray),
+            0 = no return. NaN, infinity and what lies beyond `max_range` become 0.
         labels: (H, W) int32, 0 = background, positive = object id; None = not segmented.
         intrinsics: (3, 3) float64 pinhole matrix, pixels, pixel centres at whole numbers.
         T_world_camera: (4, 4) float64, maps camera to world coordinates; None = unposed,
@@ -34,6 +38,9 @@ class Observation:
             nobody said where it was. Pixels that see it are background whatever `labels` say.
         warnings: what is usable but odd about this view, one sentence each with its remedy;
             handed on to the map, the world and every verdict.
+        max_range: metres of depth beyond which a return is none: what lies there is a driver's
+            value for "no data", or a mirror. A ray that ends nowhere has seen nothing, one that
+            ends 65 m away has "seen" all before it free.
 
     Raises:
         ObservationError: what is wrong, what would be valid, and the remedy.
@@ -47,10 +54,13 @@ class Observation:
     plane: Any = None
     robot_spheres: Any = None
     warnings: tuple[str, ...] = ()
+    max_range: float = DEFAULT_MAX_RANGE
 
     def __post_init__(self) -> None:
-        depth = _validation.check_depth(self.depth)
+        max_range = _validation.check_max_range(self.max_range)
+        depth, found = _validation.check_depth(self.depth, max_range)
         checked: dict[str, Any] = {
+            "max_range": max_range,
             "depth": depth,
             "intrinsics": _validation.check_intrinsics(self.intrinsics, depth.shape),
         }
@@ -64,7 +74,7 @@ class Observation:
             raise ObservationError(f"plane is a {type(self.plane).__name__}; give a Plane or None")
         if self.robot_spheres is not None:
             checked["robot_spheres"] = _validation.check_robot_spheres(self.robot_spheres)
-        checked["warnings"] = tuple(str(text) for text in self.warnings)
+        checked["warnings"] = tuple(dict.fromkeys([*map(str, self.warnings), *found]))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.labels is not None and self.robot_spheres is not None:

@@ -48,6 +48,7 @@ def _save_npz(obs: Observation, path: Path) -> None:
         "color": obs.color,
         "plane": _plane_numbers(obs),
         "robot_spheres": obs.robot_spheres,
+        "max_range": obs.max_range,
     }
     present = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
     write_atomically(
@@ -56,9 +57,9 @@ def _save_npz(obs: Observation, path: Path) -> None:
 
 
 def _save_folder(obs: Observation, folder: Path) -> None:
-    scale = 1e-4 if float(obs.depth.max()) <= 1e-4 * _UINT16_MAX else 1e-3
+    scale = 1e-4 if float(obs.depth.max()) < 1e-4 * (_UINT16_MAX - 1) else 1e-3
     raw = np.rint(obs.depth.astype(np.float64) / scale)
-    if raw.max() > _UINT16_MAX:
+    if raw.max() >= _UINT16_MAX:  # the largest value means "no data"
         raise ObservationError(
             f"depth reaches {obs.depth.max():g} m, more than 16 bits of millimetres hold; save "
             "as .npz"
@@ -98,6 +99,7 @@ def _write_camera(obs: Observation, scale: float, path: Path) -> None:
         "cx": matrix[0, 2],
         "cy": matrix[1, 2],
         "depth_scale": scale,
+        "max_range": obs.max_range,
     }
     if obs.T_world_camera is not None:
         content["T_world_camera"] = obs.T_world_camera.tolist()
