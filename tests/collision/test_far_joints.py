@@ -55,11 +55,25 @@ def test_no_edge_between_the_walls_is_accepted_however_far_it_starts(checker, po
             assert not checker.check_motion([a], [a])
 
 
-def test_turns_within_reach_still_count_as_none(checker):
+def test_whole_turns_within_reach_change_no_verdict_but_have_to_be_made(checker):
     for turns in (1.0, -7.0, 1e4):
         far = 2.0 * np.pi * turns
-        assert checker.check_motion([far + 0.2], [-0.2])
-        assert not checker.check_motion([far], [np.pi])
+        assert checker.check_motion([far + 0.2], [far - 0.2])
+        assert not checker.check_motion([far], [far + np.pi])
+        assert not checker.check_motion([far + 0.2], [-0.2])  # through both walls, every turn
+
+
+def test_an_edge_that_outlasts_all_patience_is_refused_and_says_so(tmp_path):
+    """A hundred thousand turns round a pillar, seven centimetres off it."""
+    beside = BallWorld(np.array([[0.0, 0.0, 0.3]]), np.array([0.5]), np.zeros((0, 4)))
+    checker = CollisionChecker(beside.baked(0.02), turning(tmp_path))
+    assert checker.check_motion([0.0], [12.0])
+    report = checker.check_motion_report([0.0], [6e5])
+    assert not report.valid
+    assert report.configurations <= kernels._MOST_CHECKS
+    assert "not certified within" in report.text()
+    with pytest.raises(RobotError, match="coarser tolerance or a shorter path"):
+        checker.min_clearance([[0.0], [9e5]])
 
 
 def test_a_joint_too_far_is_a_reason(checker):

@@ -82,7 +82,7 @@ class DiskChecker:
         return self.check_motion_buffer(np.asarray(qa, dtype=float), np.asarray(qb, dtype=float))
 
     def check_motion_buffer(self, qa, qb):
-        assert np.all(np.abs(qb - qa)[self.robot.continuous] <= np.pi), "ambiguous turn"
+        assert np.all(np.abs(qb - qa)[self.robot.continuous] <= 2 * np.pi), "beyond the copies"
         if not (self._inside_limits(qa) and self._inside_limits(qb)):
             return False
         home = np.where(self.robot.continuous, 2 * np.pi * np.round(qa / (2 * np.pi)), 0.0)

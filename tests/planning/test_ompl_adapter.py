@@ -25,7 +25,7 @@ from vprism_plan.planning import (
     to_array,
     to_state,
 )
-from vprism_plan.planning.ompl_adapter import shortest_step
+from vprism_plan.planning.ompl_adapter import nearest_turns
 
 
 def attach(checker, space=None):
@@ -142,8 +142,8 @@ def test_the_checked_motion_is_the_one_ompl_interpolates(a, b, t):
     start, end, between = (space.allocState() for _ in range(3))
     start.value, end.value = a, b
     space.interpolate(start, end, t, between)
-    step = shortest_step(np.array([a]), np.array([b]), np.array([True]))
-    gap = a + t * step[0] - between.value
+    end = nearest_turns(np.array([b]), np.array([a]), np.array([True]))[0]
+    gap = a + t * (end - a) - between.value
     assert abs(gap - 2 * np.pi * round(gap / (2 * np.pi))) < 1e-9
 
 

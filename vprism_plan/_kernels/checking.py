@@ -29,9 +29,10 @@ import numpy as np
 from vprism_plan._kernels.jit import njit
 
 _INF = np.inf
-# Radians or metres: what turns or slides farther is refused. Up to here a whole number of turns
-# is taken off to a nanometre's precision; at 1e16 radians nothing of the angle is left.
+# Radians or metres: what turns or slides farther is refused. Up to here angles are good to a
+# nanometre; at 1e16 radians nothing of them is left.
 FARTHEST = 1e6
+_MOST_CHECKS = 1_000_000  # configurations of one edge, seconds; an edge of so many is refused
 _MAX_TURN = 0.5  # radians per step of a sampled path: keeps the bend between samples small
 
 
@@ -611,6 +612,7 @@ def _safe_span(q, rf, ri, D, E, wf, link_rate, pair_rate, longest, T, lc, C, pla
 def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
     """Whether the straight edge qa -> qb is free, by conservative advancement.
 
+    The edge is what the two ends say: a joint that differs by several turns makes them all.
     Intervals between checked configurations are covered by what their clearances
     guarantee; the middle of what is left is checked next. A gap in which no sphere
     can move more than `min_motion` metres is accepted: any point of it lies within
@@ -620,13 +622,7 @@ def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
     largest motion of an accepted gap (metres; 0 = certified throughout), motion bound.
     """
     dof = ri[4]
-    co = ri[11]
-    delta = np.empty(dof)
-    for j in range(dof):
-        d = qb[j] - qa[j]
-        if ri[co + j] != 0 and np.isfinite(d):
-            d -= 2.0 * np.pi * np.round(d / (2.0 * np.pi))
-        delta[j] = d
+    delta = qb - qa
     stats[0] = -1.0
     stats[1] = 0.0
     stats[2] = 0.0
@@ -667,8 +663,9 @@ def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
             stats[2] = max(stats[2], gap)
             continue
         t = 0.5 * (a + b)
-        span = -1.0  # what cannot be divided, or only beyond the stack, counts as a collision
-        if depth <= 120 and a < t < b:
+        # What cannot be divided, or only beyond the stack or all patience, counts as a collision.
+        span = -1.0
+        if depth <= 120 and a < t < b and stats[1] < _MOST_CHECKS:
             for j in range(dof):
                 q[j] = qa[j] + t * delta[j]
             span = _safe_span(
@@ -702,16 +699,6 @@ def check_path(P, rf, ri, D, E, wf, min_motion, stats):
 
 
 @njit(cache=True, nogil=True)
-def _edge_delta(qa, qb, ri, delta):
-    """Fill delta (dof,): the way from qa to qb, continuous joints the short way round."""
-    for j in range(ri[4]):
-        d = qb[j] - qa[j]
-        if ri[ri[11] + j] != 0:
-            d -= 2.0 * np.pi * np.round(d / (2.0 * np.pi))
-        delta[j] = d
-
-
-@njit(cache=True, nogil=True)
 def _turned(delta, rf, ri):
     """Sum of the angles by which the joints turn, mimicking ones included."""
     total = 0.0
@@ -725,12 +712,11 @@ def _turned(delta, rf, ri):
 def count_steps(P, rf, ri, spacing, steps):
     """Fill steps (n - 1,) so that in one step of an edge no sphere centre moves more than
     `spacing` metres and all joints together turn by at most half a radian; return their sum."""
-    delta = np.empty(ri[4])
     link_rate = np.empty(ri[2])
     pair_rate = np.empty(ri[3])
     total = 0
     for e in range(P.shape[0] - 1):
-        _edge_delta(P[e], P[e + 1], ri, delta)
+        delta = P[e + 1] - P[e]
         motion_rates(delta, rf, ri, link_rate, pair_rate)
         fastest = _turned(delta, rf, ri) * spacing / _MAX_TURN
         for link in range(ri[2]):
@@ -756,13 +742,12 @@ def place_path(P, steps, rf, ri, C, slack):
     """
     dof = ri[4]
     q = np.empty(dof)
-    delta = np.empty(dof)
     link_rate = np.empty(ri[2])
     pair_rate = np.empty(ri[3])
     slack[:] = 0.0
     i = 0
     for e in range(P.shape[0] - 1):
-        _edge_delta(P[e], P[e + 1], ri, delta)
+        delta = P[e + 1] - P[e]
         motion_rates(delta, rf, ri, link_rate, pair_rate)
         turned = _turned(delta, rf, ri) / steps[e]
         for t in range(steps[e] + 1):

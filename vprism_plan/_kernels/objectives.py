@@ -47,17 +47,14 @@ def _frames(q, rf, ri, T):
 
 @njit(cache=True, nogil=True)
 def plan_steps(qa, qb, rf, ri, spacing, delta, link_rate):
-    """Fill delta (dof,), continuous joints the short way round, and link_rate (n_links,), a
+    """Fill delta (dof,), qb - qa, and link_rate (n_links,), a
     bound on the way of any sphere centre of a link along the motion, metres.
 
     Returns the number of steps, so that in one no centre moves more than `spacing` and the
     joints turn by at most half a radian together; the largest of the rates; the whole turn.
     """
     for j in range(ri[4]):
-        d = qb[j] - qa[j]
-        if ri[ri[11] + j] != 0:
-            d -= 2.0 * np.pi * np.round(d / (2.0 * np.pi))
-        delta[j] = d
+        delta[j] = qb[j] - qa[j]
     turned = 0.0
     link_rate[:] = 0.0
     n_links = ri[2]

@@ -90,8 +90,7 @@ def _certain_cause(
     """Name the body and the link of the deepest certain contact at a point of an edge."""
     robot = at.robot
     qa, qb = path[edge], path[min(edge + 1, len(path) - 1)]
-    turns = np.where(robot.continuous, np.round((qb - qa) / (2.0 * np.pi)), 0.0)
-    q = qa + fraction * (qb - qa - 2.0 * np.pi * turns)
+    q = qa + fraction * (qb - qa)
     n = len(at.radii)
     centers, plane, field = np.empty((3, n)), np.empty(n), np.empty(n)
     which = np.empty(n, np.int64)

@@ -24,8 +24,7 @@ class Edges:
 
     Attributes:
         path: (T, dof) waypoints.
-        delta: (T - 1, dof) change of the joints along each edge; continuous joints go
-            the short way round, as `check_motion` does.
+        delta: (T - 1, dof) change of the joints along each edge, as the rows say.
         motion: (T - 1,) upper bound of any sphere's way along each edge, metres.
         pair_motion: the same for the change of any gap between two links.
     """
@@ -86,8 +85,6 @@ def edges_of(checker: Answers, path: Numbers) -> Edges:
     refuse_far(array, "waypoint")
     _refuse_beyond_limits(robot, array)
     delta = np.diff(array, axis=0)
-    turns = np.where(robot.continuous, np.round(delta / (2.0 * np.pi)), 0.0)
-    delta = delta - 2.0 * np.pi * turns
     return Edges(array, delta, *motion_bounds(robot.arrays, delta))
 
 

@@ -31,18 +31,6 @@ _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 
 
-def interpolate(
-    robot: SphereRobot, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"], t: float
-) -> Float[np.ndarray, "dof"]:
-    """Return the point at fraction t of the straight edge qa -> qb that `check_motion` checks.
-
-    Continuous joints go the short way round, so they may leave [-pi, pi].
-    """
-    delta = qb - qa
-    turns = np.where(robot.continuous, np.round(delta / (2.0 * np.pi)), 0.0)
-    return qa + t * (delta - 2.0 * np.pi * turns)
-
-
 class CollisionChecker(Queries):
     """Answers whether configurations and edges of a robot are free of a world.
 
@@ -199,12 +187,13 @@ class CollisionChecker(Queries):
     def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
         """Return whether the straight edge from qa to qb is free, ends included.
 
-        The edge is straight in joint space; continuous joints go the short way round.
-        It is covered by conservative advancement on the clearances, with every link's
-        displacement bounded from the kinematic chain. Where clearance is so small that
-        the steps fall below `config.min_motion`, it samples: an accepted edge is free
-        up to `config.tolerance` metres of motion. With `max_risk`, the worlds that collide
-        anywhere on the edge must be few enough, too.
+        The edge is straight in joint space and means what its ends say: a continuous joint
+        turns by their difference, however often round. It is covered by conservative
+        advancement on the clearances, with every link's displacement bounded from the
+        kinematic chain. Where clearance is so small that the steps fall below
+        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance`
+        metres of motion. With `max_risk`, the worlds that collide anywhere on the edge must
+        be few enough, too.
 
         Raises:
             RobotError: An end does not have shape (dof,).
@@ -226,7 +215,7 @@ class CollisionChecker(Queries):
         state = risk = None
         if not valid and stats[0] >= 0.0:
             fraction = float(stats[0])
-            state = self.explain(interpolate(self.robot, qa, qb, fraction))
+            state = self.explain(qa + fraction * (qb - qa))
         elif self._bounded is not None and not valid:
             edge = np.stack([qa, qb])
             risk, fraction = self._bounded.estimate(edge, True), self._bounded.exceeded_at(edge)

@@ -19,7 +19,6 @@ from vprism_plan.collision import _fcl
 from vprism_plan.collision._mesh_queries import Queries, contact_rules
 from vprism_plan.collision._mesh_world import MeshWorld
 from vprism_plan.collision._solids import LinkShapes, PlacedSolids, robot_solids
-from vprism_plan.collision.checker import interpolate
 from vprism_plan.collision.comparison import causes_between
 from vprism_plan.collision.mesh_reports import PathFinding, PathOpinion
 from vprism_plan.collision.protocols import BakedWorld, Numbers
@@ -188,16 +187,14 @@ class MeshChecker:
 
         Between two of them no point of the robot moves more than `step` metres, so a
         collision may hide in at most half of that. (FCL's continuous check crashes or
-        misses with meshes, and is not used.) Continuous joints go the short way round.
+        misses with meshes, and is not used.)
 
         Raises:
             RobotError: an end does not have shape (dof,) or is not finite.
             ConfigError: step is out of range.
         """
         qa, qb = (self.robot.check_configuration(q) for q in (qa, qb))
-        return all(
-            self.is_valid(interpolate(self.robot, qa, qb, t)) for t in self._fractions(qa, qb, step)
-        )
+        return all(self.is_valid(qa + t * (qb - qa)) for t in self._fractions(qa, qb, step))
 
     def check_path(self, path: Numbers, step: float = _STEP) -> PathOpinion:
         """Check every edge of a path (T, dof) as `check_motion` does.
@@ -220,7 +217,7 @@ class MeshChecker:
         for edge, (qa, qb) in enumerate(ends):
             for t in self._fractions(qa, qb, step):
                 checked += 1
-                q = interpolate(self.robot, qa, qb, t)
+                q = qa + t * (qb - qa)
                 if not self.is_valid(q):
                     values = tuple(float(v) for v in q)
                     findings.append(PathFinding(edge, float(t), values, self.contacts(q)))
@@ -251,8 +248,7 @@ class MeshChecker:
         """Where to look on an edge: no point of the robot moves more than `step` in between."""
         if not (math.isfinite(step) and step >= 1e-5):
             raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
-        delta = interpolate(self.robot, qa, qb, 1.0) - qa
-        pieces = max(1, math.ceil(self.placed.motion_bound(delta) / step))
+        pieces = max(1, math.ceil(self.placed.motion_bound(qb - qa) / step))
         if pieces > _MAX_CONFIGURATIONS:
             raise ConfigError(
                 f"step {step} m asks for {pieces:,} configurations on one edge (at most "

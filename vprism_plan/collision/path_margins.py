@@ -10,10 +10,12 @@ from jaxtyping import Float
 from vprism_plan.collision._travel import checked_tolerance, edges_of, motion_bounds
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.collision.reports import StateReport
+from vprism_plan.errors import RobotError
 from vprism_plan.robots._values import joint_values
 
 _BATCH = 64  # configurations asked at once where clearance is too small to step by
 _HALVINGS = 60
+_MOST_INTERVALS = 1_000_000  # of a path at once: what is kept of them fits in memory
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,7 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
 
     Raises:
         RobotError: the shape is wrong, a value is not finite, a sliding joint leaves its
-            limits, or the tolerance is too small.
+            limits, the tolerance is too small, or the path is too long for it.
     """
     checked_tolerance(tolerance)
     edges = edges_of(checker, path)
@@ -139,6 +141,12 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
             best, place, q = float(found[row]), float(edge[row] + middle[row]), Q[row]
         reach = half * edges.motion[edge]
         still = (reach > tolerance) & (found - reach - slack < best - tolerance)
+        if still.sum() > _MOST_INTERVALS:
+            raise RobotError(
+                f"a path of up to {edges.motion.sum():.3g} m of motion needs more than "
+                f"{_MOST_INTERVALS:,} intervals at a tolerance of {tolerance:g} m: give a coarser "
+                "tolerance or a shorter path"
+            )
         half *= 0.5
         edge = np.repeat(edge[still], 2)
         middle = (middle[still][:, None] + half * np.array([-1.0, 1.0])).reshape(-1)

@@ -190,5 +190,7 @@ class MotionReport:
             return f"free ({how}, {self.configurations} configurations)"
         if self.risk is not None:
             return f"too risky: {self.risk.text()}"
+        if self.state is not None and self.state.valid:
+            return f"not certified within {self.configurations:,} configurations; ask for parts"
         reason = "" if self.state is None else f": {self.state.text()}"
         return f"in collision at {self.collision_fraction:.3f} of the edge{reason}"

@@ -12,7 +12,7 @@ from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._runtime import MAX_SEED
 from vprism_plan.planning._search import SearchOutcome, SearchRequest, search
 from vprism_plan.planning._shortcut import cheapen, shorten
-from vprism_plan.planning._verify import MotionCheck, resample, split_turns, verified
+from vprism_plan.planning._verify import MotionCheck, resample, verified
 from vprism_plan.planning.objectives import PathCost
 from vprism_plan.planning.result import Improvement, PlanReport, PlanResult
 
@@ -70,7 +70,6 @@ class Finish:
         self, checker: CheckerLike, path: Float[np.ndarray, "t dof"]
     ) -> Float[np.ndarray, "n dof"]:
         """Return the path with the waypoints that were asked for."""
-        path = split_turns(path, np.asarray(checker.robot.continuous, dtype=bool))
         if self.interpolate is None:
             return path
         return resample(path, MotionCheck(checker), self.interpolate)
@@ -108,10 +107,7 @@ def searched(
         )
         if found.status != "exact" or found.path is None:
             return refused or not_found(found.status, found.path, report)
-        # Wrapping moved the start to [-pi, pi); give the caller's own turns back.
-        path = found.path + (start - found.path[0])
-        path[0] = start
-        path, report = finish.shortened(checker, path, report)
+        path, report = finish.shortened(checker, found.path, report)
         path = finish.resampled(checker, path)
         found_report = replace(report, goal_index=found.goal_index)
         result = verified(checker, path, finish.clearance_step, found_report, finish.now)

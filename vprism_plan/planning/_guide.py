@@ -15,6 +15,7 @@ from jaxtyping import Float
 from ompl import base as ob
 
 from vprism_plan.planning._spaces import StateReader, write_state
+from vprism_plan.planning.ompl_adapter import nearest_turns
 
 _BIAS = 0.5  # share of the samples that come from here
 _FINEST, _WIDEST = 0.01, 0.5  # spread of samples around a path, as a share of the step
@@ -69,10 +70,8 @@ class GuidedGoal(ob.GoalSampleableRegion):
 
     def distanceGoal(self, state: Any) -> float:  # noqa: N802 - OMPL's name
         """Return the distance to the nearest goal, largest over the joints."""
-        gap = np.abs(self._goals - self._reader.read(state))
-        gap[:, self._wraps] = np.minimum(
-            gap[:, self._wraps], np.abs(2.0 * np.pi - gap[:, self._wraps])
-        )
+        q = self._reader.read(state)
+        gap = np.abs(nearest_turns(self._goals, q, self._wraps) - q)
         return float(gap.max(axis=1).min())
 
     def maxSampleCount(self) -> int:  # noqa: N802 - OMPL's name

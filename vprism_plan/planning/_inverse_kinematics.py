@@ -126,9 +126,7 @@ def descend(
         step = np.einsum("nji,nj->ni", J, np.linalg.solve(damped, error[..., None])[..., 0])
         largest = np.max(np.abs(step), axis=1, keepdims=True)
         q = q + step * np.minimum(1.0, _LARGEST_STEP / np.maximum(largest, 1e-300))
-        q = np.where(
-            free, np.mod(q + np.pi, 2 * np.pi) - np.pi, np.clip(q, robot.lower, robot.upper)
-        )
+        q = np.where(free, q, np.clip(q, robot.lower, robot.upper))
     error, _ = _error_and_jacobian(robot.arrays, tip, targets, q)
     return q, np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
 

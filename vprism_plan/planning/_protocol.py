@@ -57,7 +57,10 @@ class CheckerLike(Protocol):
         """`is_valid` without conversion or checks of the input."""
 
     def check_motion(self, qa: Any, qb: Any) -> bool:
-        """Whether the whole straight motion is allowed, both ends included."""
+        """Whether the whole straight motion is allowed, both ends included.
+
+        It is the line from qa to qb as written: no joint takes a shorter way round.
+        """
 
     def check_motion_buffer(self, qa: Any, qb: Any) -> bool:
         """`check_motion` without conversion or checks of the input."""

@@ -6,7 +6,6 @@ nothing can leak and no planner is ever used twice.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -31,7 +30,7 @@ from vprism_plan.planning.objectives import PathCost, make_objective
 from vprism_plan.planning.ompl_adapter import (
     VPrismMotionValidator,
     VPrismStateValidityChecker,
-    shortest_step,
+    nearest_turns,
 )
 from vprism_plan.planning.result import Improvement
 
@@ -54,7 +53,7 @@ class SearchRequest:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """What a search found; `path` (T, dof) is unwrapped but not yet verified.
+    """What a search found; `path` (T, dof) begins at the start as given and is not yet verified.
 
     `history` has the best path each time it had become noticeably better.
     """
@@ -127,7 +126,7 @@ def search(
         reader = StateReader(space, len(start))
         now = clock_named(request.clock)
         began = now()
-        status, history = _solve(planner, problem, reader, request, kind, guided, held)
+        status, history = _solve(planner, problem, reader, start, request, kind, guided, held)
         planned = now()
 
         verdict: Literal["exact", "approximate", "timeout"] = "timeout"
@@ -138,7 +137,7 @@ def search(
             claimed = status == ob.PlannerStatus.EXACT_SOLUTION and problem.hasExactSolution()
             # OMPL calls approximate solutions "solved"; the last state decides.
             verdict = "exact" if claimed and goal_index is not None else "approximate"
-            path = _waypoints(reader, solution)
+            path = _waypoints(reader, solution, start)
         return SearchOutcome(
             status=verdict,
             path=path,
@@ -187,6 +186,7 @@ def _solve(
     planner: Any,
     problem: Any,
     reader: StateReader,
+    start: Float[np.ndarray, " dof"],
     request: SearchRequest,
     kind: PlannerKind,
     guided: GuidedGoal | None,
@@ -223,7 +223,7 @@ def _solve(
             better = not history or value < history[-1].cost
             idle = 0 if better else idle + 1
             if better:
-                path = _waypoints(reader, problem.getSolutionPath())
+                path = _waypoints(reader, problem.getSolutionPath(), start)
                 history.append(Improvement(now() - began, value, path))
                 if guided is not None:
                     guided.follow(path)
@@ -247,19 +247,18 @@ def _any_of(timed: Any, settled: CostConvergence | None, improved: Improvements)
 
 def _reached(reader: StateReader, solution: Any, goals: Float[np.ndarray, "g dof"]) -> int | None:
     last = reader.read(solution.getState(solution.getStateCount() - 1))
-    gaps = np.abs(goals - last)
-    # Whole turns of a wrapping joint are the same state.
-    turns = np.array(reader.wraps) * 2.0 * np.pi * np.round(gaps / (2.0 * np.pi))
-    worst = np.max(np.abs(gaps - turns), axis=1)
+    worst = np.max(np.abs(nearest_turns(goals, last, np.array(reader.wraps)) - last), axis=1)
     best = int(np.argmin(worst))
     return best if worst[best] <= _GOAL_TOLERANCE else None
 
 
-def _waypoints(reader: StateReader, path: Any) -> Float[np.ndarray, "t dof"]:
-    """Copy a path to numpy, wrapping coordinates continued from row to row."""
-    raw = np.array([reader.read(state).copy() for state in path.getStates()])
+def _waypoints(
+    reader: StateReader, path: Any, start: Float[np.ndarray, " dof"]
+) -> Float[np.ndarray, "t dof"]:
+    """Copy a path to numpy, wrapping coordinates continued from row to row, from the start's
+    own turns on."""
     wraps = np.array(reader.wraps)
-    if wraps.any():
-        steps = [shortest_step(a, b, wraps) for a, b in pairwise(raw)]
-        raw[1:] = raw[0] + np.cumsum(steps, axis=0).reshape(-1, raw.shape[1])
-    return raw
+    rows = [start]
+    for state in path.getStates()[1:]:
+        rows.append(nearest_turns(reader.read(state).copy(), rows[-1], wraps))
+    return np.stack(rows)

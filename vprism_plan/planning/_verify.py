@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float
 from vprism_plan.planning._clock import Now
 from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._shortcut import Check
-from vprism_plan.planning.ompl_adapter import check_straight, straight_pieces
 from vprism_plan.planning.result import PlanReport, PlanResult
 
 _log = logging.getLogger(__name__)
@@ -25,9 +24,9 @@ _ROUNDING = 1e-9  # radians or metres beyond a joint limit that count as on it
 class MotionCheck:
     """Counts and answers `checker.check_motion` for edges that may become part of a path.
 
-    An edge that turns a continuous joint by half a turn or more is refused: whoever
-    follows the path could take it for the shorter way round. So is one that leaves the
-    joint limits, which not every checker knows.
+    An edge that turns a continuous joint by half a turn or more is refused: it means what it
+    says, but others who follow the path could take it for the shorter way round. So is one
+    that leaves the joint limits, which not every checker knows.
     """
 
     def __init__(self, checker: CheckerLike) -> None:
@@ -42,7 +41,7 @@ class MotionCheck:
             return False
         if outside_limits(self._robot, np.stack([qa, qb])).any():
             return False
-        return check_straight(self._check, qa, qb, self._turns)
+        return bool(self._check(qa, qb))
 
 
 def outside_limits(robot: Any, path: Float[np.ndarray, "t dof"]) -> Bool[np.ndarray, " t"]:
@@ -66,14 +65,6 @@ def resample(
         split = all(check(a, b) for a, b in pairwise(pieces))
         rows += list(pieces[1:]) if split else [edge[1]]
     return np.stack(rows)
-
-
-def split_turns(path: Float[np.ndarray, "t dof"], turns: Any) -> Float[np.ndarray, "n dof"]:
-    """Add waypoints where a continuous joint turns so far that its direction is unclear."""
-    rows = [path[:1]]
-    for a, b in pairwise(path):
-        rows.append(np.stack(straight_pieces(a, b, turns)[1:]))
-    return np.concatenate(rows)
 
 
 def interpolated(path: Float[np.ndarray, "t dof"], spacing: float) -> Float[np.ndarray, "n dof"]:
@@ -139,15 +130,11 @@ def _first_bad_edge(
     checker: CheckerLike, path: Float[np.ndarray, "t dof"], verdicts: list[Any]
 ) -> int | None:
     """Append a report per checked motion; return the first refused edge, None if all pass."""
-    turns = np.asarray(checker.robot.continuous, dtype=bool)
     outside = outside_limits(checker.robot, path)
-
-    def check(qa: np.ndarray, qb: np.ndarray) -> bool:
-        verdicts.append(checker.check_motion_report(qa, qb))
-        return bool(verdicts[-1].valid and checker.check_motion(qa, qb))
-
     for edge, (a, b) in enumerate(pairwise(path)):
-        if not check_straight(check, a, b, turns) or outside[edge : edge + 2].any():
+        verdicts.append(checker.check_motion_report(a, b))
+        free = verdicts[-1].valid and checker.check_motion(a, b)
+        if not free or outside[edge : edge + 2].any():
             return edge
     return None
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._inverse_kinematics import Targets, descend, find_tip, tip_poses
+from vprism_plan.planning.ompl_adapter import nearest_turns
 
 _APART = 0.05  # solutions nearer to each other in every joint are one
 
@@ -208,7 +209,7 @@ def solve_pose(
         robot, tip, targets, _starts(robot, reference, n, rng), config.iterations
     )
     good = (away <= config.position_tolerance) & (turn <= config.rotation_tolerance)
-    return GoalSolutions(_distinct(q[good], reference), n)
+    return GoalSolutions(_distinct(robot, q[good], reference), n)
 
 
 def solve_region(
@@ -224,9 +225,8 @@ def solve_region(
     starts = _starts(robot, reference, config.attempts, rng)
     targets = region.draw(config.attempts, rng)
     q, _, _ = descend(robot, tip, targets, starts, config.iterations)
-    return GoalSolutions(
-        _distinct(q[region.contains(*tip_poses(robot, tip, q))], reference), config.attempts
-    )
+    good = region.contains(*tip_poses(robot, tip, q))
+    return GoalSolutions(_distinct(robot, q[good], reference), config.attempts)
 
 
 def _starts(
@@ -238,9 +238,10 @@ def _starts(
 
 
 def _distinct(
-    q: Float[np.ndarray, "n dof"], reference: Float[np.ndarray, " dof"]
+    robot: Any, q: Float[np.ndarray, "n dof"], reference: Float[np.ndarray, " dof"]
 ) -> Float[np.ndarray, "m dof"]:
-    """Drop near duplicates; nearest to the reference first."""
+    """Drop near duplicates, and whole turns; nearest to the reference first."""
+    q = nearest_turns(q, reference, np.asarray(robot.continuous, dtype=bool))
     kept: list[np.ndarray] = []
     for candidate in q[np.argsort(np.linalg.norm(q - reference, axis=1), kind="stable")]:
         if all(np.max(np.abs(candidate - other)) > _APART for other in kept):

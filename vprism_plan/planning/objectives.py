@@ -21,7 +21,7 @@ from ompl import base as ob
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._motion_risk import KINDS, MotionRisk
 from vprism_plan.planning._spaces import StateReader
-from vprism_plan.planning.ompl_adapter import shortest_step, straight_pieces
+from vprism_plan.planning.ompl_adapter import nearest_turns
 
 # Rates (n,) per metre at configurations (n, dof).
 Rates = Callable[[np.ndarray], np.ndarray]
@@ -149,10 +149,9 @@ class PathCost:
 
     def edge(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
         """Return the cost of a straight motion; continuous joints turn as the difference says."""
-        pieces = list(pairwise(straight_pieces(qa, qb, self._wraps)))
         if self.worst:
-            return max(float(self.risk.worst(a, b)) for a, b in pieces)
-        risk = sum(float(self.risk.motion(a, b)) for a, b in pieces)
+            return float(self.risk.worst(qa, qb))
+        risk = float(self.risk.motion(qa, qb))
         return risk + self.length_weight * space_distance(qa, qb, self._wraps)
 
     def path(self, path: Float[np.ndarray, "t dof"]) -> float:
@@ -189,15 +188,11 @@ class _RiskBase(ob.OptimizationObjective):
         self._reader = StateReader(space, checker.robot.dof)
         self._distance = space.distance
         self._wraps = np.array(self._reader.wraps)
-        self._turns = self._wraps | np.asarray(checker.robot.continuous, dtype=bool)
-        self._any_turns = bool(self._turns.any())
+        self._any_wraps = bool(self._wraps.any())
 
-    def _pieces(self, s1: Any, s2: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _ends(self, s1: Any, s2: Any) -> tuple[np.ndarray, np.ndarray]:
         qa, qb = self._reader.read_pair(s1, s2)
-        if not self._any_turns:
-            return [(qa, qb)]
-        end = qa + shortest_step(qa, qb, self._wraps)
-        return list(pairwise(straight_pieces(qa, end, self._turns)))
+        return (qa, nearest_turns(qb, qa, self._wraps)) if self._any_wraps else (qa, qb)
 
     def stateCost(self, state: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the rate at a state."""
@@ -254,9 +249,8 @@ class VPrismRiskObjective(_RiskBase):
 
     def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the cost of the straight motion between two states."""
-        risk = self._cost.risk.motion
-        total = sum(risk(a, b) for a, b in self._pieces(s1, s2))
-        return ob.Cost(total + self._length_weight * self._distance(s1, s2))
+        risk = self._cost.risk.motion(*self._ends(s1, s2))
+        return ob.Cost(risk + self._length_weight * self._distance(s1, s2))
 
     def motionCostHeuristic(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return what no path between the states undercuts: length, since risk is not negative."""
@@ -288,8 +282,7 @@ class VPrismMinimaxRiskObjective(_RiskBase):
 
     def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the largest rate on the straight motion between two states."""
-        worst = self._cost.risk.worst
-        return ob.Cost(max(worst(a, b) for a, b in self._pieces(s1, s2)))
+        return ob.Cost(self._cost.risk.worst(*self._ends(s1, s2)))
 
     def motionCostHeuristic(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return zero: some path may run no risk."""

@@ -10,7 +10,6 @@ that holds `si` closes a reference cycle that neither side can collect.
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from threading import get_ident
 from typing import Any
 
@@ -22,9 +21,7 @@ from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._spaces import StateReader
 from vprism_plan.robots._values import joint_values
 
-# A continuous joint that moves further than this is checked in pieces, so that "the
-# straight line" and "the shorter way round" are the same motion for every checker.
-_UNAMBIGUOUS_TURN = 0.9 * math.pi
+_TURN = 2.0 * math.pi
 
 
 class VPrismStateValidityChecker(ob.StateValidityChecker):
@@ -113,8 +110,7 @@ class VPrismMotionValidator(ob.MotionValidator):
         self._is_valid = checker.is_valid_buffer
         self._check_motion = checker.check_motion_buffer
         self._wraps = np.array(self._reader.wraps)
-        self._turns = self._wraps | np.asarray(checker.robot.continuous, dtype=bool)
-        self._any_turns = bool(self._turns.any())
+        self._any_wraps = bool(self._wraps.any())
 
     def checkMotion(self, s1: Any, s2: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
         """Return whether the straight motion from s1 to s2 is valid, both ends included.
@@ -125,51 +121,28 @@ class VPrismMotionValidator(ob.MotionValidator):
         qa, qb = self._reader.read_pair(s1, s2)
         if not self._is_valid(qb):
             return False
-        if self._any_turns:
-            return check_straight(self._check_motion, qa, self._unwrapped(qa, qb), self._turns)
+        if self._any_wraps:
+            qb = nearest_turns(qb, qa, self._wraps)
         return bool(self._check_motion(qa, qb))
 
-    def _unwrapped(
-        self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]
-    ) -> Float[np.ndarray, " dof"]:
-        """Return qb with wrapping coordinates moved to where interpolation from qa ends."""
-        return qa + shortest_step(qa, qb, self._wraps)
 
+def nearest_turns(
+    q: Float[np.ndarray, "... dof"], reference: Float[np.ndarray, " dof"], wraps: Any
+) -> Float[np.ndarray, "... dof"]:
+    """Return q moved by whole turns in the coordinates marked in `wraps`: nearest to `reference`.
 
-def shortest_step(
-    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], wraps: Any
-) -> Float[np.ndarray, " dof"]:
-    """Return qb - qa, taking the shorter way round in the coordinates marked in `wraps`.
-
-    Angles lie in [-pi, pi]. This mirrors OMPL's own rule term by term: at exactly half
-    a turn the plain difference is kept, one bit beyond it the other way is taken.
+    A motion is what its two ends say. OMPL's circles are the exception: they interpolate to
+    the nearest copy of an angle, and keep the angle itself in [-pi, pi]. This is where the
+    two meet; nothing else takes turns off. It mirrors OMPL's rule term by term: at exactly
+    half a turn q stays, one bit beyond it the other way is taken.
     """
-    step = qb - qa
-    far = wraps & (np.abs(step) > math.pi)
-    if far.any():
-        step[far] -= np.copysign(2.0 * math.pi, step[far])
-    return step
-
-
-def straight_pieces(
-    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], turns: Any
-) -> list[np.ndarray]:
-    """Return points of the line from qa to qb between which no joint turns very far.
-
-    A checker may or may not take the shorter way round; pieces of less than half a
-    turn leave it no choice. `turns` marks the joints this concerns.
-    """
-    widest = float(np.max(np.abs(qb - qa), where=turns, initial=0.0))
-    pieces = max(1, math.ceil(widest / _UNAMBIGUOUS_TURN))
-    return [qa + (qb - qa) * (k / pieces) if k else qa for k in range(pieces)] + [qb]
-
-
-def check_straight(
-    check_motion: Any, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], turns: Any
-) -> bool:
-    """Check the straight line from qa to qb however far its continuous joints turn."""
-    points = straight_pieces(qa, qb, turns)
-    return all(bool(check_motion(a, b)) for a, b in pairwise(points))
+    away = q - reference
+    if not (wraps & (np.abs(away) > math.pi)).any():
+        return q
+    turns = np.round(away / _TURN)
+    left = away - _TURN * turns
+    turns += (left > math.pi).astype(float) - (left < -math.pi)
+    return np.where(wraps, q - _TURN * turns, q)
 
 
 def last_valid(
@@ -194,16 +167,15 @@ def last_valid(
     """
     qa = joint_values(qa, checker.robot, "qa")
     qb = joint_values(qb, checker.robot, "qb")
-    turns = np.asarray(checker.robot.continuous, dtype=bool)
     if not checker.is_valid(qa):
         return None, 0.0
-    if check_straight(checker.check_motion, qa, qb, turns):
+    if checker.check_motion(qa, qb):
         return qb.copy(), 1.0
     good, bad = 0.0, 1.0
     while bad - good > tolerance:
         middle = 0.5 * (good + bad)
         left, right = qa + good * (qb - qa), qa + middle * (qb - qa)
-        if check_straight(checker.check_motion, left, right, turns):
+        if checker.check_motion(left, right):
             good = middle
         else:
             bad = middle

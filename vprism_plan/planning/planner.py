@@ -28,7 +28,7 @@ from vprism_plan.planning._second_opinion import refuse_unfit, reviewed
 from vprism_plan.planning._verify import verified
 from vprism_plan.planning.goals import PoseGoalConfig, ReachRegion
 from vprism_plan.planning.objectives import PathCost, RiskObjective
-from vprism_plan.planning.ompl_adapter import check_straight, shortest_step
+from vprism_plan.planning.ompl_adapter import nearest_turns
 from vprism_plan.planning.result import PlanReport, PlanResult
 
 
@@ -193,14 +193,7 @@ def _direct(
 ) -> tuple[int, np.ndarray] | None:
     """Return the first goal that a straight, hence shortest, motion reaches, and that path."""
     turns = np.asarray(checker.robot.continuous, dtype=bool)
-    for index, goal in enumerate(goals):
-        end = start + _turned(goal - start, turns)
-        if check_straight(checker.check_motion, start, end, turns):
+    for index, end in enumerate(nearest_turns(goals, start, turns)):
+        if checker.check_motion(start, end):
             return index, np.stack([start, end])
     return None
-
-
-def _turned(step: Float[np.ndarray, " dof"], turns: Any) -> Float[np.ndarray, " dof"]:
-    """Drop whole turns from the continuous coordinates of a step."""
-    whole = np.where(turns, 2.0 * np.pi * np.round(step / (2.0 * np.pi)), 0.0)
-    return shortest_step(np.zeros_like(step), step - whole, turns)

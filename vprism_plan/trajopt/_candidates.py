@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Float
 
 from vprism_plan.planning import CheckerLike
-from vprism_plan.planning._verify import interpolated, one_line, split_turns, verified
-from vprism_plan.planning.ompl_adapter import check_straight
+from vprism_plan.planning._verify import interpolated, one_line, verified
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.trajopt._minimize import REASONS, Limits, Minimum, adam, lbfgs
 from vprism_plan.trajopt._objective import Emphasis, Objective
@@ -75,9 +74,9 @@ class Candidates:
         self.seeds, self.given, self.settings = seeds, given, settings
         self.objective = Objective(settings.cost, seeds.q)
         self.limits = Limits(settings.iterations, settings.tolerance, deadline)
-        self.turns = np.asarray(robot.continuous, dtype=bool)
-        self.lower = np.where(self.turns, -np.inf, robot.lower)
-        self.upper = np.where(self.turns, np.inf, robot.upper)
+        turns = np.asarray(robot.continuous, dtype=bool)
+        self.lower = np.where(turns, -np.inf, robot.lower)
+        self.upper = np.where(turns, np.inf, robot.upper)
         count = len(seeds.q)
         self.iterations = np.zeros(count, dtype=np.int64)
         self.refused = [""] * count
@@ -199,17 +198,16 @@ class Candidates:
         self, judge: CheckerLike, path: Float[np.ndarray, "t dof"]
     ) -> tuple[PlanResult, int]:
         """Return the verdict on a path, and the edge of it that is refused, -1 if none."""
-        whole = split_turns(path, self.turns)
         edge = self._bad_edge(judge, path)
         if edge >= 0:
             why = judge.check_motion_report(path[edge], path[edge + 1])
             return _refusal(path, edge, f"is refused: {one_line(why)}", why), edge
-        result = verified(judge, whole, self.settings.clearance_step, _no_numbers())
+        result = verified(judge, path, self.settings.clearance_step, _no_numbers())
         self.motion_checks += result.report.motion_checks
         kept = self.settings.kept
         if kept is None or not result.solved:
             return result, -1
-        clearance, place = path_clearance(judge, whole, self.settings.clearance_step)
+        clearance, place = path_clearance(judge, path, self.settings.clearance_step)
         if clearance >= kept - _LOSS:
             report = replace(result.report, min_clearance=clearance)
             return replace(result, report=report), -1
@@ -221,7 +219,7 @@ class Candidates:
         """Return the first edge that the checker refuses, -1 if none."""
         for edge, (a, b) in enumerate(pairwise(path)):
             self.motion_checks += 1
-            if not check_straight(judge.check_motion, a, b, self.turns):
+            if not judge.check_motion(a, b):
                 return edge
         return -1
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Costs by compiled kernels on the CPU, as functions that autograd knows."""
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -62,9 +61,6 @@ class PathKernels:
     ) -> tuple[Float[np.ndarray, "steps dof"], Int[np.ndarray, " steps"]]:
         """Return the change of the joints along each edge, and into how many it is divided."""
         delta = np.diff(Q, axis=0)
-        if self._robot.continuous.any():
-            turns = np.where(self._robot.continuous, np.round(delta / (2.0 * math.pi)), 0.0)
-            delta -= 2.0 * math.pi * turns
         division = self._subdivision
         parts = np.full(len(delta), division.parts or 1, dtype=np.int64)
         if division.parts is None and len(delta):

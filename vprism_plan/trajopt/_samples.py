@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Configurations between waypoints, so that costs see what lies between them."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -83,21 +82,6 @@ def require_dof(robot: Any, q: Tensor) -> None:
         )
 
 
-def path_steps(
-    robot: Any, q: Float[Tensor, "*batch time dof"]
-) -> Float[Tensor, "*batch steps dof"]:
-    """Change of the joints along each edge; with a robot, continuous joints go the short way."""
-    delta = q.diff(dim=-2)
-    if robot is None:
-        return delta
-    require_dof(robot, q)
-    if not bool(robot.continuous.any()):
-        return delta
-    free = torch.tensor(robot.continuous, device=q.device)
-    turns = torch.where(free, (delta.detach() / (2.0 * math.pi)).round(), 0.0)
-    return delta - 2.0 * math.pi * turns
-
-
 def sample_paths(
     robot: Any,
     q: Float[Tensor, "b time dof"],
@@ -114,7 +98,8 @@ def sample_paths(
     """
     centers_of = robot.sphere_centers if centers_of is None else centers_of
     count, time, dof = q.shape
-    delta = path_steps(robot, q)
+    require_dof(robot, q)
+    delta = q.diff(dim=-2)
     parts = _parts(robot, q.detach(), delta.detach(), subdivision, centers_of)
     # The last waypoint is an edge that goes nowhere.
     parts = torch.cat([parts, parts.new_ones(count, 1)], dim=1)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
-from vprism_plan.planning.ompl_adapter import check_straight, shortest_step
+from vprism_plan.planning.ompl_adapter import nearest_turns
 
 _SAME = 1e-6  # radians or metres by which a given path may miss start and goal
 _DRAWS = 64  # configurations among which a detour's middle is chosen
@@ -107,10 +107,7 @@ def make_seeds(
     names = [f"initial {i}" for i in range(len(given))]
     found = [along(path, waypoints) for path in given]
     if len(found) < count or not found:
-        step = goal - start
-        step -= np.where(turns, 2.0 * np.pi * np.round(step / (2.0 * np.pi)), 0.0)
-        end = start + shortest_step(np.zeros_like(step), step, turns)
-        end = np.where(turns, end, goal)
+        end = nearest_turns(goal, start, turns)
         found.append(along(np.stack([start, end]), waypoints))
         names.append("straight")
     source = _Source(checker, found[-1], found[0], seed)
@@ -149,10 +146,7 @@ class _Source:
         for q in draws:
             if not self.checker.is_valid(q):
                 continue
-            free = sum(
-                check_straight(self.checker.check_motion, *edge, self.free)
-                for edge in ((a, q), (q, b))
-            )
+            free = sum(self.checker.check_motion(*edge) for edge in ((a, q), (q, b)))
             way = float(np.linalg.norm(q - a) + np.linalg.norm(b - q))
             if (free, -way) > rank:
                 best, rank = q, (free, -way)
@@ -181,9 +175,8 @@ def _checked(
         )
     if not np.isfinite(array).all():
         raise PlanningError(f"initial path {number} holds NaN or infinite values")
-    shift = _whole(array[0] - start, turns)
-    array -= shift
-    end = goal + _whole(array[-1] - goal, turns)
+    array += nearest_turns(array[0], start, turns) - array[0]
+    end = nearest_turns(goal, array[-1], turns)
     for name, row, wanted in (("begins", array[0], start), ("ends", array[-1], end)):
         gap = np.abs(row - wanted)
         if gap.max() > _SAME:
@@ -194,8 +187,3 @@ def _checked(
             )
     array[0], array[-1] = start, end
     return array
-
-
-def _whole(difference: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Return the whole turns in a difference of joint values."""
-    return np.where(turns, 2.0 * np.pi * np.round(difference / (2.0 * np.pi)), 0.0)

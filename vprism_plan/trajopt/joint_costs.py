@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.trajopt._samples import path_steps, require_dof
+from vprism_plan.trajopt._samples import require_dof
 from vprism_plan.trajopt.cost import TrajectoryCost, at_least
 
 
@@ -29,7 +29,7 @@ class SmoothnessCost(TrajectoryCost):
 
     Args:
         velocity, acceleration, jerk: factors of the terms, at least 0.
-        robot: with it, continuous joints go the short way round, as the checker's edges do.
+        robot: with it, trajectories of another number of joints are refused.
         duration: seconds from the first waypoint to the last.
         joint_weights: (dof,) factors on the squared differences; None is 1.
         weight, name: see `TrajectoryCost`.
@@ -65,7 +65,9 @@ class SmoothnessCost(TrajectoryCost):
 
     def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
         """Return the cost without its weight."""
-        difference = path_steps(self.robot, q)
+        if self.robot is not None:
+            require_dof(self.robot, q)
+        difference = q.diff(dim=-2)
         factors: Tensor | None = None
         if self.joint_weights is not None:
             if len(self.joint_weights) != q.shape[-1]:
