@@ -39,8 +39,8 @@ class ClearanceCost(TrajectoryCost):
     (`SplineField`), less a radius so much larger that a positive gap proves the sphere free
     at that configuration. Inside obstacles the gap falls with slope 1 towards the inside, as
     far as they go: there is no depth at which the gradient is cut off. It is zero only on
-    ridges where several ways out are equally long. What lies between samples is left to
-    verification.
+    ridges where several ways out are equally long. What lies between samples, and what was
+    seen outside the world's grid, is left to verification.
 
     Args:
         world: a `World`, or a `CollisionChecker`.
