@@ -27,13 +27,17 @@ def look_at(eye, target=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 @dataclass
 class Scene:
-    """Spheres (centre, radius) and boxes (lower, upper) on the table z = 0, x, y in `table`."""
+    """Spheres (centre, radius) and boxes (lower, upper) on the table z = 0, x, y in `table`.
+
+    `panels` are unlabelled parallelograms, each a corner and two edges: walls, boards, floors.
+    """
 
     spheres: list = field(default_factory=list)
     boxes: list = field(default_factory=list)
     table: tuple = ((-0.6, -0.6), (0.6, 0.6))
     floor: float | None = None
     wall: float | None = None  # a wall at x = wall, facing -x
+    panels: list = field(default_factory=list)
 
     def render(self, pose, K, shape=(240, 320)) -> tuple[np.ndarray, np.ndarray]:
         """Exact depth (0 = nothing) and labels: spheres first, then boxes."""
@@ -60,12 +64,45 @@ class Scene:
                 hit((self.floor - origin[2]) / direction[:, 2], BACKGROUND)
             if self.wall is not None:
                 hit((self.wall - origin[0]) / direction[:, 0], BACKGROUND)
+            for corner, first, second in self.panels:
+                hit(_panel(origin - np.asarray(corner), direction, first, second), BACKGROUND)
             for number, (centre, radius) in enumerate(self.spheres, start=1):
                 hit(_sphere(origin - np.asarray(centre), direction, radius), number)
             for number, (low, high) in enumerate(self.boxes, start=len(self.spheres) + 1):
                 hit(_box(origin, direction, np.asarray(low), np.asarray(high)), number)
         depth[~np.isfinite(depth)] = 0.0
         return depth.reshape(shape), labels.reshape(shape)
+
+
+def bin_walls(slope, half=(0.16, 0.09), height=0.15) -> list:
+    """Panels of a bin around a floor of `half` sizes (m) at z = 0; `slope` in degrees."""
+    out = height / np.tan(np.radians(slope))
+    a, b = half
+    walls = []
+    for side in (1.0, -1.0):  # wider than the corner, where the next wall hides it
+        walls.append(((side * a, -b - out, 0), (0, 2 * (b + out), 0), (side * out, 0, height)))
+        walls.append(((-a - out, side * b, 0), (2 * (a + out), 0, 0), (0, side * out, height)))
+    return walls
+
+
+def shelf_walls(width=0.8, depth=0.3, clear=0.35) -> list:
+    """Back, sides and upper board of a shelf, open towards -x, over a board at z = 0."""
+    left, up, back = (0, width, 0), (0, 0, clear), (depth, 0, 0)
+    low = (-depth / 2, -width / 2, 0.0)
+    return [
+        ((depth / 2, -width / 2, 0.0), left, up),
+        (low, back, up),
+        ((-depth / 2, width / 2, 0.0), back, up),
+        ((-depth / 2, -width / 2, clear), back, left),
+    ]
+
+
+def _panel(origin, direction, first, second):
+    edges = np.array([first, second], dtype=float)
+    normal = np.cross(*edges)
+    t = -(origin @ normal) / (direction @ normal)
+    along = np.linalg.solve(edges @ edges.T, edges @ (origin + t[:, None] * direction).T)
+    return np.where(((along >= 0) & (along <= 1)).all(axis=0), t, np.inf)
 
 
 def _sphere(origin, direction, radius):
