@@ -99,6 +99,29 @@ def test_the_rate_of_survival_bounds_the_marginal(checker, motions):
         assert p >= min(touched(checker, [q]).mean(), 1.0 - 0.5 / 64) - 1e-12
 
 
+@pytest.mark.parametrize(("kind", "seed"), [("joint", 7), ("entropy", 8)])
+def test_an_objective_is_prepared_in_parts_and_bakes_nothing_that_nobody_asks_for(
+    demo_world, checker, monkeypatch, kind, seed
+):
+    """Its first use took ten seconds, whatever the time limit."""
+
+    def baked(*_, **__):
+        raise AssertionError("planners check motions by themselves")
+
+    monkeypatch.setattr(type(demo_world), "certain_field", baked)
+    config = CheckerConfig(n_worlds=64, risk_seed=seed)  # draws that nobody has asked for
+    alone = CollisionChecker(demo_world, checker.robot, config)
+    for step in RiskObjective(kind).preparation(alone):
+        step()
+    monkeypatch.setattr("vprism_plan.world.posterior_worlds.judge", baked)
+    cost = RiskObjective(kind).cost(alone)
+    cost.edge(np.zeros(7), np.full(7, 0.05))
+    worlds = alone.risk_setting().worlds
+    before = len(worlds.tables.rows)
+    worlds.bake()
+    assert len(worlds.tables.rows) > 2 * before
+
+
 @pytest.mark.parametrize("kind", ["occupancy", "entropy"])
 def test_fields_are_read_at_every_sample_that_matters(checker, motions, kind):
     """The stride over free stretches leaves nothing out: sample by sample it is the same."""

@@ -23,6 +23,7 @@ from vprism_plan.planning import (
     state_space,
     to_state,
 )
+from vprism_plan.planning._attempt import not_found
 from vprism_plan.planning._shortcut import cheapen, shorten
 
 START, GOAL = [-0.7, 0.0], [0.7, 0.0]
@@ -237,3 +238,53 @@ def test_a_malformed_objective_names_the_value(arguments, message):
 def test_a_checker_without_a_posterior_is_told_what_to_bring():
     with pytest.raises(PlanningError, match="DiskChecker has no posterior"):
         plan(one_disk(), START, GOAL, "RRTstar", objective=RiskObjective("joint"))
+
+
+class Clock:
+    """Time that passes only where a test says so."""
+
+    def __init__(self, monkeypatch):
+        self.time = 0.0
+        monkeypatch.setattr("vprism_plan.planning.planner.clock_named", lambda _: lambda: self.time)
+
+    def step(self, seconds, done):
+        def run():
+            self.time += seconds
+            done.append(seconds)
+
+        return run
+
+
+class Prepared(RiskObjective):
+    """An objective whose preparation takes the time that it is given."""
+
+    steps = ()
+
+    def preparation(self, checker):
+        return Prepared.steps
+
+
+def test_preparing_an_objective_counts_and_stops_when_the_time_is_up(monkeypatch):
+    clock, done = Clock(monkeypatch), []
+    monkeypatch.setattr(Prepared, "steps", [clock.step(t, done) for t in (0.02, 0.04, 9.0)])
+    result = plan(one_disk(), START, GOAL, "RRTstar", 0.05, objective=Prepared(slope))
+    assert done == [0.02, 0.04]
+    assert (result.status, result.path) == ("timeout", None)
+    assert result.report.objective_time == pytest.approx(0.06)
+    assert "preparing the objective 'function' took 0.06 s of the 0.05 s" in result.message
+
+
+def test_the_search_gets_what_preparing_left(monkeypatch):
+    clock, done = Clock(monkeypatch), []
+    monkeypatch.setattr(Prepared, "steps", [clock.step(t, done) for t in (0.5, 1.5)])
+    limits = []
+
+    def searched(judge, start, goals, request, finish, report, begin):
+        limits.append(request.time_limit)
+        return not_found("timeout", None, report)
+
+    monkeypatch.setattr("vprism_plan.planning.planner.searched", searched)
+    result = plan(one_disk(), START, GOAL, "RRTstar", 5.0, objective=Prepared(slope))
+    assert done == [0.5, 1.5]
+    assert limits == [pytest.approx(3.0)]
+    assert "within 5 s" in result.message

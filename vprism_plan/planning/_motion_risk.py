@@ -2,6 +2,7 @@
 """What a straight motion risks, as a number that planners can add up."""
 
 import math
+from collections.abc import Callable
 from itertools import product
 from typing import Any, Literal
 from weakref import WeakKeyDictionary
@@ -14,6 +15,7 @@ from vprism_plan.errors import PlanningError
 
 Kind = Literal["survival", "joint", "occupancy", "entropy"]
 KINDS: tuple[str, ...] = ("survival", "joint", "occupancy", "entropy")
+_OF_FIELDS = ("occupancy", "entropy")
 
 _PAD = 0.25  # metres around what is uncertain in which distances to it are known
 _LEAST = 1e-3  # probability, or nats, below which a field counts as 0
@@ -63,11 +65,8 @@ class MotionRisk:
             raise PlanningError(f"kind is {kind!r}; valid kinds of risk are {', '.join(KINDS)}")
         if not (math.isfinite(spacing) and 1e-3 <= spacing <= 0.5):
             raise PlanningError(f"spacing is {spacing!r}; it must be 0.001 to 0.5 metres")
-        if not hasattr(checker, "risk_setting"):
-            raise PlanningError(
-                f"a {type(checker).__name__} has no posterior to take risks from; give a "
-                "CollisionChecker over a World, or a function as the kind of risk"
-            )
+        for step in preparation(checker, kind):
+            step()
         self.kind = kind
         self.spacing = float(spacing)
         self._at = checker.risk_setting()
@@ -78,16 +77,15 @@ class MotionRisk:
         self._kept: dict[tuple[bytes, bytes], float] = {}
         self._ceiling = 1.0 - 0.5 / worlds.n_worlds  # p = 1 must stay finite
         self._touched = np.zeros(worlds.n_worlds, np.uint8)
-        if kind in ("occupancy", "entropy"):
+        if kind in _OF_FIELDS:
             self._field = _field(worlds, self._at.world, kind)
             self._weights = _weights(self._at, kind)
             self._directions = _POINTS if kind == "occupancy" else 0.8 * _POINTS
-        else:
-            # Whoever asks first would wait for the draws: inside a planner's time limit.
-            marks = worlds.new_marks()
-            marks[np.unique(self._at.sphere_tables[self._at.sphere_tables >= 0])] = True
-            worlds.bake_marked(marks)
         self._marks = worlds.new_marks()
+        # Asked once without a sphere, so that nothing compiles inside a planner's time limit.
+        q, self._tables = np.zeros(len(self._delta)), np.full_like(self._at.sphere_tables, -1)
+        self._sweep(q, q)
+        self._tables = self._at.sphere_tables
 
     def motion(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
         """Return the cost of the straight motion between two configurations, either way."""
@@ -142,7 +140,7 @@ class MotionRisk:
         steps, way, turned = kernels.plan_steps(
             qa, qb, at.floats, at.ints, self.spacing, self._delta, self._rates
         )
-        if self.kind in ("occupancy", "entropy"):
+        if self.kind in _OF_FIELDS:
             values = np.empty(steps + 1)
             kernels.sweep_field(
                 qa, self._delta, steps, self._rates, at.floats, at.ints, at.radii, self._weights,
@@ -156,7 +154,7 @@ class MotionRisk:
             tables = worlds.tables
             missing = kernels.sweep_draws(
                 qa, self._delta, steps, self._rates, turned, at.floats, at.ints, at.radii,
-                at.sphere_tables, self._possible, self._corner, worlds.resolution,
+                self._tables, self._possible, self._corner, worlds.resolution,
                 tables.distance_row, tables.rows, tables.lowest, worlds.first, scale, reach,
                 counts, self._touched, self._marks,
             )  # fmt: skip
@@ -164,6 +162,26 @@ class MotionRisk:
                 return counts, int(self._touched.sum()), way
             worlds.bake_marked(self._marks)
             self._marks = worlds.new_marks()
+
+
+def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
+    """The long parts of making a `MotionRisk`, in turn; what one has done is kept.
+
+    Raises:
+        PlanningError: the checker has no posterior.
+    """
+    if not hasattr(checker, "risk_setting"):
+        raise PlanningError(
+            f"a {type(checker).__name__} has no posterior to take risks from; give a "
+            "CollisionChecker over a World, or a function as the kind of risk"
+        )
+
+    def worlds() -> Any:
+        return checker.risk_setting().worlds
+
+    if kind in _OF_FIELDS:
+        return worlds, lambda: _possible(worlds()), lambda: _field(worlds(), checker.world, kind)
+    return worlds, lambda: worlds().sample(), lambda: _possible(worlds())
 
 
 # Baking takes longer than many a search, so objectives over one map share it.

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning._motion_risk import KINDS, MotionRisk
+from vprism_plan.planning._motion_risk import KINDS, MotionRisk, preparation
 from vprism_plan.planning._spaces import StateReader
 from vprism_plan.planning.ompl_adapter import nearest_turns
 
@@ -61,8 +61,15 @@ class RiskObjective:
         kind = self.kind if isinstance(self.kind, str) else "function"
         return f"worst {kind}" if self.worst else kind
 
+    def preparation(self, checker: Any) -> tuple[Callable[[], Any], ...]:
+        """The long parts of `cost`, in turn; each keeps what it has done."""
+        return preparation(checker, self.kind) if isinstance(self.kind, str) else ()
+
     def cost(self, checker: Any) -> "PathCost":
-        """Return what paths of a checker's robot cost; draws and bakes worlds if need be."""
+        """Return what paths of a checker's robot cost; draws worlds if nobody has.
+
+        Where worlds are asked about, they are baked then: by the search, within its limit.
+        """
         return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
 
 

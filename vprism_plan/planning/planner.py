@@ -71,7 +71,9 @@ def plan(
             four joints: a (4, 4) array is a pose if its last row is 0 0 0 1.)
         planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
             BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
-        time_limit: time for the search in seconds, more than 0; on `clock`.
+        time_limit: time for the search in seconds, more than 0; on `clock`. Preparing an
+            objective (worlds drawn, the first time) counts; where it alone takes as long, the
+            status is "timeout".
         seed: an integer from 0. The same seed gives the same path as long as the search
             ends by itself before the limit. OMPL's generator is global: this seeds it.
         stop: when the optimising planners (RRTstar, InformedRRTstar, SORRTstar, BITstar,
@@ -134,8 +136,10 @@ def plan(
     report = replace(
         report, state_checks=1 + len(goals) + len(report.refused_goals), motion_checks=len(goals)
     )
-    cost, prepared = _prepared(checker, objective, planner, now)
-    report = replace(report, **prepared)
+    cost, report = _prepared(checker, objective, now, report)
+    left = request.time_limit - report.objective_time
+    if left <= 0.0:
+        return replace(_unprepared(report), warnings=warnings)
     finish = Finish(simplify, float(simplify_time), interpolate, clearance_step, now, cost)
 
     def attempt(judge: CheckerLike, limit: float, number: int) -> PlanResult:
@@ -153,7 +157,7 @@ def plan(
         begin = Begin(warm and planner_kind(planner).goal_bias, lead, index)
         return searched(judge, q_start, goals, other, finish, report, begin)
 
-    result = within_risk(checker, attempt, request.time_limit, now)
+    result = within_risk(checker, attempt, left, now)
     if result.path is not None:
         found = result.report.path_length if cost is None else cost.path(result.path)
         result = replace(result, report=replace(result.report, cost=found))
@@ -162,26 +166,45 @@ def plan(
 
 
 def _prepared(
-    checker: CheckerLike, objective: str | RiskObjective, planner: str, now: Now
-) -> tuple[PathCost | None, dict[str, Any]]:
-    """Return what paths cost, None for length, and what to report of it."""
+    checker: CheckerLike, objective: str | RiskObjective, now: Now, report: PlanReport
+) -> tuple[PathCost | None, PlanReport]:
+    """Return what paths cost, None for length, and the report with the time that took.
+
+    Between its parts the time is looked at; where it is up, there is no cost.
+    """
     if objective == "length":
-        return None, {}
+        return None, report
     if not isinstance(objective, RiskObjective):
         raise PlanningError(
             f"objective is {objective!r}; it must be 'length' or a RiskObjective, for example "
             "RiskObjective(kind='joint')"
         )
-    kind = planner_kind(planner)
+    kind = planner_kind(report.planner)
     if not kind.honours_objective:
         able = ", ".join(name for name, k in planners().items() if k.honours_objective)
         raise PlanningError(
-            f"{planner} does not honour an objective{': it ' if kind.note else ''}{kind.note}; "
-            f"planners that do are {able}"
+            f"{report.planner} does not honour an objective{': it ' if kind.note else ''}"
+            f"{kind.note}; planners that do are {able}"
         )
-    began = now()
-    cost = objective.cost(checker)
-    return cost, {"objective": objective.name, "objective_time": now() - began}
+    began, cost = now(), None
+    for step in objective.preparation(checker):
+        step()
+        if now() - began >= report.time_limit:
+            break
+    else:
+        cost = objective.cost(checker)
+    return cost, replace(report, objective=objective.name, objective_time=now() - began)
+
+
+def _unprepared(report: PlanReport) -> PlanResult:
+    return PlanResult(
+        path=None,
+        status="timeout",
+        report=report,
+        message=f"preparing the objective '{report.objective}' took {report.objective_time:.2f} s "
+        f"of the {report.time_limit:g} s allowed; what was prepared is kept: allow more time, plan "
+        "again, or prepare it ahead by objective.cost(checker)",
+    )
 
 
 def _riskless(cost: PathCost, path: Float[np.ndarray, "t dof"]) -> bool:
