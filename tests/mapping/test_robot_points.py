@@ -27,7 +27,8 @@ def raw() -> Observation:
 
 @pytest.fixture(scope="module")
 def marked(raw) -> Observation:
-    return ignore_robot(raw, BALL[None], [RADIUS], 0.005, remove_flying=False)
+    bare = replace(raw, labels=np.where(raw.labels == 2, 0, raw.labels))
+    return ignore_robot(bare, BALL[None], [RADIUS], 0.005, remove_flying=False)
 
 
 def data_of(obs: Observation, seed: int = 0):

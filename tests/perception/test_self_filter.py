@@ -24,6 +24,7 @@ from vprism_plan.perception import (
     save_observation,
     segment_tabletop,
 )
+from vprism_plan.robots import Robot
 
 K = intrinsics()
 POSE = look_at((-0.7, 0.1, 0.6))
@@ -71,15 +72,34 @@ def test_pixels_of_the_robot_are_those_within_its_padded_balls(seed, posed):
     radii, padding = rng.uniform(0.02, 0.4, 7), float(rng.uniform(0, 0.1))
     marked = ignore_robot(obs, centers, radii, padding, remove_flying=False)
     expected = oracle(obs, centers, radii + padding)
-    np.testing.assert_array_equal(marked.sees_robot, expected)
-    np.testing.assert_array_equal(marked.labels, np.where(expected, 0, obs.labels))
+    np.testing.assert_array_equal(replace(marked, labels=None).sees_robot, expected)
+    np.testing.assert_array_equal(marked.sees_robot, expected & (obs.labels == 0))
+    np.testing.assert_array_equal(marked.labels, obs.labels)  # balls alone take no label away
     np.testing.assert_array_equal(marked.depth, obs.depth)
     assert not obs.sees_robot.any()  # what was given is left alone
 
 
-def test_every_pixel_of_the_arm_is_marked_and_none_of_the_cube():
+@pytest.fixture(scope="module")
+def arm_robot(tmp_path_factory) -> Robot:
+    """The arm as the collision geometry of a URDF, held by one sphere that stands far out."""
+    solid = (
+        '<collision><origin xyz="{} {} {}"/><geometry><sphere radius="{}"/></geometry></collision>'
+    )
+    arm = "".join(solid.format(*center, radius) for center, radius in ARM)
+    text = (
+        f'<robot name="arm"><link name="base"/><link name="arm">{arm}</link>'
+        '<joint name="x" type="prismatic"><parent link="base"/><child link="arm"/>'
+        '<axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+    )
+    path = tmp_path_factory.mktemp("arm") / "arm.urdf"
+    path.write_text(text)
+    return Robot.from_urdf(path, spheres={"arm": [{"center": [-0.2, -0.15, 0.3], "radius": 0.4}]})
+
+
+def test_every_pixel_of_the_arm_is_marked_and_none_of_the_cube(arm_robot):
     obs = picture()
-    marked = ignore_robot(obs, *centers_and_radii())
+    marked = ignore_self(obs, arm_robot, [0.0])
+    assert marked.warnings == ()
     np.testing.assert_array_equal(marked.sees_robot, obs.labels == 9)
     assert obs.object_ids == (1, 9)
     assert marked.object_ids == (1,)
@@ -88,14 +108,67 @@ def test_every_pixel_of_the_arm_is_marked_and_none_of_the_cube():
     assert (marked.depth != obs.depth).sum() < 5
 
 
-def test_marks_move_with_the_world_and_survive_other_steps():
-    marked = ignore_robot(picture(), *centers_and_radii())
+def test_marks_move_with_the_world_and_labels_outrank_them(arm_robot):
+    marked = ignore_self(picture(), arm_robot, [0.0])
+    assert marked.sees_robot.sum() > 1000
     aligned = align_to_table(marked)
     assert not np.allclose(aligned.pose, marked.pose)
     np.testing.assert_array_equal(aligned.sees_robot, marked.sees_robot)
     relabelled = replace(marked, labels=np.full(marked.shape, 5))
-    assert (relabelled.labels[marked.sees_robot] == 0).all()
-    assert relabelled.object_ids == (5,)
+    assert (relabelled.labels == 5).all()
+    assert not relabelled.sees_robot.any()
+    again = ignore_self(relabelled, arm_robot, [0.0])
+    assert (again.labels[again.depth > 0] == 5).all()
+    assert "of object 5 is seen in or on the pictured robot" in again.warnings[0]
+
+
+def test_a_label_is_the_robots_only_if_it_lies_on_the_surface_of_its_solids(arm_robot):
+    """Standing off by more than the noise, deep inside, or partly elsewhere: an object."""
+    obs = picture()
+    on_arm = obs.labels == 9
+    exact = ignore_self(obs, arm_robot, [0.0])
+    assert not exact.labels[on_arm].any()
+    rng = np.random.default_rng(0)
+    for away, taken in ((0.002, True), (-0.002, True), (-0.012, False), (0.012, False)):
+        depth = obs.depth - on_arm * (away + rng.normal(0, 1e-4, obs.shape))
+        moved = replace(obs, depth=depth)
+        marked = ignore_self(moved, arm_robot, [0.0], remove_flying=False)
+        assert (9 in marked.object_ids) != taken
+    spilled = np.where((obs.labels == 0) & (np.arange(obs.shape[1]) < 100), 9, obs.labels)
+    marked = ignore_self(replace(obs, labels=spilled), arm_robot, [0.0], remove_flying=False)
+    np.testing.assert_array_equal(marked.labels, spilled)
+    assert "of object 9 is seen in or on the pictured robot" in marked.warnings[0]
+    assert "set its label to 0" in marked.warnings[0]
+    with_balls = ignore_robot(obs, *centers_and_radii())
+    np.testing.assert_array_equal(with_balls.labels, obs.labels)
+    assert "100% of object 9" in with_balls.warnings[0]
+
+
+def test_a_robot_that_the_camera_sees_through_was_elsewhere(arm_robot):
+    marked = ignore_self(picture(), arm_robot, [-0.2])
+    assert any("the camera saw through" in text and "check q" in text for text in marked.warnings)
+    hidden = replace(picture(), depth=np.full(picture().shape, 0.05))  # a hand before the lens
+    assert not any("saw through" in text for text in ignore_self(hidden, arm_robot, [0]).warnings)
+
+
+def test_spheres_that_stand_out_of_the_robot_mask_and_clear_nothing_but_on_ones_word(arm_robot):
+    obs = replace(picture(), labels=None)
+    plain = ignore_self(obs, arm_robot, [0.0], 0.0)
+    gap = np.min([np.linalg.norm(obs.point_image() - c, axis=-1) - r for c, r in ARM], axis=0)
+    assert plain.sees_robot.sum() > 1000
+    assert (gap[plain.sees_robot] < 0.006).all()
+    assert plain.robot_spheres[:, 4].max() == 0.06
+    given = ignore_self(obs, arm_robot, [0.0], 0.0, room=0.02)
+    np.testing.assert_array_equal(given.sees_robot, plain.sees_robot)
+    assert given.robot_spheres[:, 4].max() == pytest.approx(0.42)
+    assert "0.02 m around them counts as free by your word" in given.warnings[0]
+
+
+def test_links_without_solids_are_named(arm_robot):
+    bare = replace(arm_robot, geometry_as_read={})
+    marked = ignore_self(replace(picture(), labels=None), bare, [0.0])
+    assert "['arm'] have no solids" in marked.warnings[0]
+    assert marked.robot_spheres[:, 4].tolist() == [0.4]
 
 
 def test_marking_again_adds_to_what_is_marked():
@@ -151,7 +224,7 @@ def test_flying_pixels_along_the_outline_are_removed():
     scene = Scene(spheres=list(ARM), boxes=[CUBE])
     clean, labels = scene.render(POSE, K)
     depth, made = spoil(clean, np.random.default_rng(2), holes=0.0)
-    obs = Observation(depth, labels, K, POSE)
+    obs = Observation(depth, np.where(labels > len(ARM), labels, 0), K, POSE)
     centers, radii = centers_and_radii()
     kept = ignore_robot(obs, centers, radii, remove_flying=False)
     marked = ignore_robot(obs, centers, radii)
@@ -164,10 +237,10 @@ def test_flying_pixels_along_the_outline_are_removed():
     assert gone[near & ~made].mean() < 0.1
 
 
-def test_an_object_that_vanishes_under_the_robot_is_named(caplog):
+def test_an_object_that_vanishes_under_the_robot_is_named(caplog, arm_robot):
     with caplog.at_level(logging.WARNING):
-        ignore_robot(picture(), *centers_and_radii())
-    assert "every pixel of objects [9] lies on the robot" in caplog.text
+        ignore_self(picture(), arm_robot, [0.0])
+    assert "objects [9] are the pictured robot" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -186,11 +259,22 @@ def test_balls_that_mean_nothing_are_refused(centers, radii, padding, error, mes
         ignore_robot(picture(), centers, radii, padding)
 
 
+@pytest.mark.parametrize("room", [-0.01, np.inf])
+def test_a_room_that_means_nothing_is_refused(room, arm_robot):
+    with pytest.raises(ConfigError, match=f"room is {room}"):
+        ignore_robot(picture(), *centers_and_radii(), room=room)
+    with pytest.raises(ConfigError, match=f"room is {room}"):
+        ignore_self(picture(), arm_robot, [0.0], room=room)
+
+
 def test_spheres_of_a_wrong_shape_are_refused():
     obs = picture()
-    for value in (np.zeros(4), np.zeros((2, 3)), np.array([["a"] * 4])):
+    for value in (np.zeros(4), np.zeros((2, 3)), np.zeros((2, 6)), np.array([["a"] * 4])):
         with pytest.raises(ObservationError, match="they must be rows"):
             replace(obs, robot_spheres=value)
+    for radii in ((-0.1, 0.1), (0.1, -0.1), (0.0, 0.0), (0.1, np.nan)):
+        with pytest.raises(ObservationError, match="row 0 of robot_spheres"):
+            replace(obs, robot_spheres=[[0, 0, 1, *radii]])
 
 
 def test_marks_are_saved_and_loaded_and_old_files_still_load(tmp_path):

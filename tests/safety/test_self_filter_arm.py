@@ -14,6 +14,7 @@ from vprism_plan.perception import ignore_self
 Q = np.array([1.165, 0.402, -0.404, -2.102, -1.637, 1.372, -2.476])
 BASE = np.array([[0, -1, 0, 0.05], [1, 0, 0, -0.6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=float)
 MARGIN = 0.005
+ROOM = MARGIN + 2.0 * 0.01  # metres: what the documentation says is enough
 HIDDEN = 0.025  # metres, radius of a ball behind the arm
 
 
@@ -42,7 +43,7 @@ class Setting:
         eye = scene.camera.center
         hand = self.robot.link_poses(Q)["panda_hand"][:3, 3]
         self.axis = (hand - eye) / np.linalg.norm(hand - eye)
-        # 4 cm clear of the robot's spheres: nearer, the filter takes it for the robot's own.
+        # 4 cm clear of the robot's spheres: nearer, `room` says that it is not there.
         pose = np.eye(4)
         pose[:3, 3] = hand + 0.18 * self.axis
         self.hidden = shapes.sphere(HIDDEN, pose)
@@ -54,7 +55,7 @@ class Setting:
         full = Scene(solids, labels, scene.camera, None, 0, "arm")
         self.seen = render(full, scene.camera, noise=DepthNoise(), seed=3)
         assert 7 not in self.seen.object_ids
-        self.marked = ignore_self(self.seen, self.robot, Q)
+        self.marked = ignore_self(self.seen, self.robot, Q, room=ROOM)
 
     def checker(self, observation, robot, **config) -> vp.CollisionChecker:
         world = vp.World(vp.fit_map(observation, seed=0), vp.WorldConfig(**config))
@@ -74,6 +75,7 @@ def checker(setting) -> vp.CollisionChecker:
 def test_the_pictured_configuration_is_refused_without_the_filter_and_valid_with_it(
     setting, checker
 ):
+    assert "0.025 m around them counts as free by your word" in " ".join(checker.warnings)
     report = setting.checker(setting.seen, setting.robot).explain(Q)
     assert not report.valid
     bodies = {contact.body for contact in report.contacts}
@@ -81,6 +83,33 @@ def test_the_pictured_configuration_is_refused_without_the_filter_and_valid_with
     assert checker.is_valid(Q)
     assert checker.explain(Q).shares["occluded"] == 0.0
     assert checker.clearance(Q) > MARGIN
+
+
+@pytest.fixture(scope="module")
+def strict(setting) -> vp.CollisionChecker:
+    """Without anybody's word: only the robot's own solids are known to be free."""
+    return setting.checker(ignore_self(setting.seen, setting.robot, Q), setting.robot)
+
+
+def test_all_that_the_arm_hides_is_refused_and_the_remedy_named(setting, strict, ball_robot):
+    """Points in its shadow up to its very surface, where collision spheres stand out of it."""
+    assert strict.warnings == ()
+    report = strict.explain(Q)
+    assert {contact.body for contact in report.contacts} == {"occluded"}
+    assert "ignore_self(..., room=0.025) is your word for it" in report.text()
+    small = vp.CollisionChecker(strict.world, ball_robot(0.005))
+    image, eye = setting.marked.point_image(), setting.seen.camera_center
+    on_arm = image[setting.marked.sees_robot]
+    on_arm = on_arm[:: len(on_arm) // 300]
+    ways = (on_arm - eye) / np.linalg.norm(on_arm - eye, axis=1, keepdims=True)
+    checked = 0
+    for distance in np.arange(0.03, 0.3, 0.01):
+        points = on_arm + distance * ways
+        gap = np.min([solid.signed_distance(points) for solid in setting.arm], axis=0)
+        behind = (gap > 0.001) & (points[:, 2] > 0.0)
+        assert not small.is_valid_batch(points[behind]).any()
+        checked += int((behind & (gap < 0.02)).sum())
+    assert checked > 200
 
 
 def test_space_behind_the_arm_is_refused(setting, checker, ball_robot):

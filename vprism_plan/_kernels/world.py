@@ -167,6 +167,31 @@ def mark_boxes(points, half, origin, spacing, label, lattice):
                     lattice[x, y, z] = label
 
 
+@njit(cache=True, nogil=True)
+def mark_cells_within(balls, origin, spacing, marked):
+    """Mark every cell that lies wholly in one of the balls (x, y, z, radius)."""
+    diagonal = 0.5 * math.sqrt(3.0)  # from a cell's middle to its corner, in cells
+    shape = marked.shape
+    for i in range(balls.shape[0]):
+        reach = balls[i, 3] / spacing - diagonal
+        if reach < 0.0:
+            continue
+        lo = np.empty(3, np.int64)
+        hi = np.empty(3, np.int64)
+        middle = np.empty(3)
+        for a in range(3):
+            middle[a] = (balls[i, a] - origin[a]) / spacing - 0.5
+            lo[a] = min(max(math.ceil(middle[a] - reach), 0), shape[a])
+            hi[a] = min(max(math.floor(middle[a] + reach) + 1, 0), shape[a])
+        for x in range(lo[0], hi[0]):
+            dx = (x - middle[0]) ** 2
+            for y in range(lo[1], hi[1]):
+                dy = dx + (y - middle[1]) ** 2
+                for z in range(lo[2], hi[2]):
+                    if dy + (z - middle[2]) ** 2 <= reach * reach:
+                        marked[x, y, z] = True
+
+
 # --- Visibility ---------------------------------------------------------------------
 
 

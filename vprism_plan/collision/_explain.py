@@ -9,6 +9,7 @@ from jaxtyping import Float
 from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.collision.protocols import Answers, BakedWorld, NodeField, RuledWorld
 from vprism_plan.collision.reports import Contact, Kind, StateReport
+from vprism_plan.world.pictured import free_balls
 
 _STATUS_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
 _SAMPLES = 96
@@ -105,6 +106,7 @@ def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
     robot, world, margin = checker.robot, checker.world, checker.config.margin
     centers, plane, which, field = checker.sphere_clearances(q)
     deepest: dict[tuple[str, str], Contact] = {}
+    robots = free_balls(getattr(world.map, "views", ()))
 
     def keep(contact: Contact) -> None:
         key = (contact.link, contact.body)
@@ -131,6 +133,9 @@ def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
                 ball = centers[s] + radius * unit_ball_points()
                 sure = float(np.max(world.map.occupancy(ball)))
             detail = _policy_detail(checker, kind)
+            if kind == "occluded":
+                at = np.append(centers[s], radius)
+                detail += _beside_pictured_robot(at, robots, margin, world)
             keep(
                 _contact(
                     kind,
@@ -188,6 +193,20 @@ def _policy_detail(checker: Answers, kind: Kind) -> str:
     if kind == "background":
         return "observed points without an object label"
     return ""
+
+
+def _beside_pictured_robot(
+    sphere: Float[np.ndarray, "4"],
+    robots: Float[np.ndarray, "s 4"],
+    margin: float,
+    world: BakedWorld,
+) -> str:
+    """The remedy for a sphere in the shadow of the robot as it was in a picture, or nothing."""
+    away = np.linalg.norm(robots[:, :3] - sphere[:3], axis=1)
+    if not (away <= robots[:, 3] + sphere[3]).any():
+        return ""
+    room = margin + 2.0 * float(world.config.resolution)
+    return f"; beside the pictured robot: ignore_self(..., room={room:g}) is your word for it"
 
 
 def _allowed_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:

@@ -219,15 +219,16 @@ def check_color(value: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def check_robot_spheres(value: Any) -> np.ndarray:
-    """Return (S, 4) float64 rows (x, y, z, radius), metres."""
+    """Return float64 rows (x, y, z, radius) or (x, y, z, radius, free), metres."""
     spheres = to_numpy(value, "robot_spheres")
-    if spheres.ndim != 2 or spheres.shape[1] != 4 or spheres.dtype.kind not in "fiu":
+    if spheres.ndim != 2 or spheres.shape[1] not in (4, 5) or spheres.dtype.kind not in "fiu":
         raise ObservationError(
             f"robot_spheres have shape {spheres.shape} and type {spheres.dtype}; they must be "
-            "rows (x, y, z, radius) in metres, camera frame"
+            "rows (x, y, z, radius) or (x, y, z, radius, free) in metres, camera frame"
         )
     spheres = spheres.astype(np.float64)
-    bad = ~(np.isfinite(spheres).all(axis=1) & (spheres[:, 3] > 0.0))
+    radii = spheres[:, 3:]
+    bad = ~np.isfinite(spheres).all(axis=1) | (radii < 0.0).any(axis=1) | ~(radii > 0.0).any(axis=1)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         raise ObservationError(

@@ -6,8 +6,6 @@ depth is measured along z, in metres; pixel (u, v) = (column, row), and a whole
 number is the *centre* of a pixel (OpenCV).
 """
 
-import math
-
 import numpy as np
 from jaxtyping import Float, Num
 
@@ -48,32 +46,6 @@ def project(
     u = intrinsics[0, 0] * points[:, 0] / safe + intrinsics[0, 2]
     v = intrinsics[1, 1] * points[:, 1] / safe + intrinsics[1, 2]
     return np.stack([u, v], axis=1), z
-
-
-def ball_window(
-    center: tuple[float, float, float],
-    radius: float,
-    intrinsics: Float[np.ndarray, "3 3"],
-    shape: tuple[int, int],
-) -> tuple[slice, slice]:
-    """Rows and columns that hold every pixel whose point can lie in a ball (camera frame, m).
-
-    From the box around the ball; the whole image if that reaches the camera plane.
-    """
-    x, y, z = center
-    near, far = z - radius, z + radius
-    if near <= 0.0:
-        return (slice(0, 0),) * 2 if far <= 0.0 else (slice(None), slice(None))
-    slices = []
-    for axis, middle, size in ((1, y, shape[0]), (0, x, shape[1])):
-        focal, offset = float(intrinsics[axis, axis]), float(intrinsics[axis, 2])
-        ends = [
-            side / depth for side in (middle - radius, middle + radius) for depth in (near, far)
-        ]
-        first = math.floor(focal * min(ends) + offset)
-        last = math.ceil(focal * max(ends) + offset)
-        slices.append(slice(min(max(first, 0), size), min(max(last + 1, 0), size)))
-    return slices[0], slices[1]
 
 
 def transform_points(

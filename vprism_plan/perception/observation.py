@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Int32
 
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import _validation
-from vprism_plan.perception.camera import backproject, ball_window, point_image
+from vprism_plan.perception.balls import within_balls
+from vprism_plan.perception.camera import backproject, point_image
 from vprism_plan.perception.plane import Plane
 
 # Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.
@@ -34,8 +35,10 @@ class Observation:
         color: (H, W, 3) uint8 RGB, or None.
         plane: support plane in the world frame if it is known.
         robot_spheres: (S, 4) float64 rows (x, y, z, radius), metres, *camera* frame: balls
-            that held the robot when the image was taken (`ignore_robot` sets them); None =
-            nobody said where it was. Pixels that see it are background whatever `labels` say.
+            of the robot when the image was taken (`ignore_self` and `ignore_robot` set them);
+            None = nobody said where it was. What an unlabelled pixel shows within `radius` is
+            the robot. Nothing else was within a fifth number, `free`, of the middle: hidden
+            space there is free (left out: the radius). Labels outrank the balls.
         warnings: what is usable but odd about this view, one sentence each with its remedy;
             handed on to the map, the world and every verdict.
         max_range: metres of depth beyond which a return is none: what lies there is a driver's
@@ -77,8 +80,6 @@ class Observation:
         checked["warnings"] = tuple(dict.fromkeys([*map(str, self.warnings), *found]))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
-        if self.labels is not None and self.robot_spheres is not None:
-            self.labels[self.sees_robot] = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -102,7 +103,7 @@ class Observation:
 
     @cached_property
     def sees_robot(self) -> Bool[np.ndarray, "h w"]:
-        """Pixels whose point lies in one of `robot_spheres`.
+        """Pixels without a label whose point lies in one of `robot_spheres`.
 
         What they see is neither an object nor background: it moves. The ray up to it is
         free, and what lies behind it is hidden.
@@ -110,13 +111,11 @@ class Observation:
         seen = np.zeros(self.shape, dtype=bool)
         if self.robot_spheres is None:
             return seen
-        points = backproject(self.depth, self.intrinsics)
-        for x, y, z, radius in self.robot_spheres.tolist():
-            window = ball_window((x, y, z), radius, self.intrinsics, self.shape)
-            part = points[window]
-            # NaN, where there is no return, is not within anything.
-            square = ((part - np.array([x, y, z])) ** 2).sum(axis=-1)
-            seen[window] |= square <= radius * radius
+        asked = self.depth > 0
+        if self.labels is not None:
+            asked &= self.labels == 0
+        points = backproject(self.depth, self.intrinsics)[asked]
+        seen[asked] = within_balls(points, self.robot_spheres[:, :4])
         return seen
 
     @cached_property

@@ -6,15 +6,27 @@ from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from vprism_plan.errors import ConfigError, ObservationError
-from vprism_plan.perception._image_graph import flying_pixels, surface_image
+from vprism_plan.perception._image_graph import depth_noise, flying_pixels, surface_image
 from vprism_plan.perception._validation import to_numpy
-from vprism_plan.perception.camera import invert_transform, transform_points
+from vprism_plan.perception.balls import within_balls
+from vprism_plan.perception.camera import (
+    backproject,
+    invert_transform,
+    project,
+    transform_points,
+)
 from vprism_plan.perception.observation import Observation
 
 logger = logging.getLogger(__name__)
+
+# A label is the robot's if so much of what it shows is on the robot's surface: within three
+# standard deviations of the depth noise, and 3 mm by which balls miss a solid's edges.
+_OWN_SHARE, _EDGES = 0.9, 0.003
+# Shares from which on a label beside the robot, or seeing through the robot, is odd.
+_MANY, _SEEN_THROUGH = 0.05, 0.1
 
 
 @runtime_checkable
@@ -35,64 +47,60 @@ def ignore_robot(
     radii: Any,
     padding: float = 0.01,
     *,
+    room: float = 0.0,
     remove_flying: bool = True,
 ) -> Observation:
-    """Mark the pixels that see the robot, given the balls that held it when the image was taken.
+    """Mark the pixels that see the robot, given balls that it filled when the image was taken.
 
-    Such pixels become neither objects nor background obstacles, and do not vote for the
-    support plane. The rays up to them remain free space, and what lies behind them is
-    occluded, as behind anything that was seen. The balls themselves, and a grid step
-    around them, count as free although nobody saw through them: the robot was there.
+    Unlabelled pixels within the padded balls become neither objects nor background
+    obstacles, and do not vote for the support plane. The rays up to them remain free space,
+    and what lies behind them is occluded, as behind anything that was seen. Hidden space in
+    the balls themselves, without padding, is free: the robot was there.
 
-    Between the robot and its padded balls that is an assumption. What hides there, or is
-    held and not attached to the robot, is not seen, and a surface that was seen there is
-    ignored. So keep `padding` small, but no smaller than the error of the camera's pose
-    and the sensor's noise; and for the pictured configuration to be valid, no smaller than
-    the checker's margin and half the world's resolution together.
+    That is your word. Balls that stand out of the robot give away space that nobody saw, and
+    clutter there is not seen: for a robot with a URDF, use `ignore_self`. What is seen outranks
+    it: a label within the balls stays and is an obstacle, and behind what was seen in the
+    balls or within 10 cm of them no hidden space is free.
+
+    `padding` is for the errors of the camera's pose and the sensor's noise. For the pictured
+    configuration to be valid, hidden space around its spheres must be free as well: `room`
+    of the checker's margin and twice the world's resolution is enough.
 
     Flying pixels, which sensors invent along the robot's outline between it and what lies
     behind, are set to depth 0, "no return" (`remove_flying`): they would be obstacles in
     mid-air beside the arm. Only pixels within two of one that sees the robot are touched.
 
-    Called again (a second robot, a tool), it adds to what is marked.
+    Called again (a second robot, a tool), it adds to what is marked. Call it after labelling.
 
     Args:
         observation: Posed, or else `centers` are in the camera frame.
         centers: (S, 3) world, metres; array or tensor.
         radii: (S,) metres.
-        padding: Metres added to every radius.
+        padding: Metres beyond the balls in which a pixel still sees the robot.
+        room: Metres beyond the balls in which hidden space is free, by your word.
         remove_flying: Whether flying pixels along the outline are removed.
 
     Returns:
-        The observation with `robot_spheres` set, and label 0 where it sees the robot.
+        The observation with `robot_spheres` set, and a warning if `room` is above 0.
 
     Raises:
         ObservationError: centres or radii do not fit each other or are not finite.
-        ConfigError: a padding that is negative or not finite.
+        ConfigError: a padding or room that is negative or not finite.
     """
-    if not (np.isfinite(padding) and padding >= 0.0):
-        raise ConfigError(f"padding is {padding}; it must be 0 or more (metres)")
+    _check_metres("padding", padding)
+    _check_metres("room", room)
     places, sizes = to_numpy(centers, "centers"), to_numpy(radii, "radii")
     if places.ndim != 2 or places.shape[1:] != (3,) or sizes.shape != places.shape[:1]:
         raise ObservationError(
             f"centers have shape {places.shape} and radii {sizes.shape}; they must be (S, 3) and "
             "(S,), metres"
         )
-    in_camera = transform_points(invert_transform(observation.pose), places)
-    spheres = np.column_stack([in_camera, sizes.astype(np.float64) + padding])
-    if (sizes <= 0).any():
-        spheres[sizes <= 0, 3] = -1.0  # padding must not make sense of a wrong radius
-    before = observation.robot_spheres
-    marked = replace(
-        observation,
-        robot_spheres=spheres if before is None else np.vstack([before, spheres]),
-    )
-    if remove_flying:
-        flying = _flying_outline(marked)
-        marked = replace(marked, depth=np.where(flying, 0.0, marked.depth))
-        logger.info("%d flying pixels along the robot's outline removed", int(flying.sum()))
-    _report(observation, marked)
-    return marked
+    sizes = np.where(sizes > 0, sizes.astype(np.float64), -np.inf)  # no padding mends these
+    marked = _with_balls(observation, places, sizes + padding, sizes + room)
+    if room > 0.0:
+        text = f"{room:g} m around the pictured robot's balls count as free by your word"
+        marked = replace(marked, warnings=(*marked.warnings, text))
+    return _finished(observation, marked, remove_flying)
 
 
 def ignore_self(
@@ -101,39 +109,182 @@ def ignore_self(
     q: Any,
     padding: float = 0.01,
     *,
+    room: float | None = None,
     remove_flying: bool = True,
 ) -> Observation:
     """`ignore_robot` for a robot that stood in configuration `q` when the image was taken.
 
-    Give the robot that will be checked later: with its padding and with what it holds
-    attached, or its own shadow would refuse the larger robot.
+    What counts is the robot's own solids (`Robot.solid_balls`): the URDF's collision geometry
+    and the meshes of attached objects, without padding and scale. An unlabelled pixel sees the
+    robot if its point is within `padding` and three standard deviations of the depth noise
+    of a solid. Hidden space inside the solids is free; beside and behind them it stays hidden.
+
+    A label of which nine tenths lie on the surface of the solids, within the noise, is the
+    robot's and becomes 0. All others stay, and are obstacles.
+
+    The collision spheres of a checker stand out of the solids, so in the shadow of its own
+    links the pictured configuration is usually refused as "occluded". `room` is your word
+    that nothing is there: hidden space within the robot's collision spheres and `room` metres
+    around them is free, but not behind things that were seen in it or near it. Give the
+    robot that will be checked, with its padding and what it holds; the checker's margin and
+    twice the world's resolution are enough (0.02 by default).
+
+    Links without solids (spheres only, or a mesh file that is missing) are their collision
+    spheres, as `ignore_robot` has it; a warning names them.
 
     Args:
-        observation: Posed in the world in which the robot's base stands.
-        robot: A `Robot`, or anything with its `sphere_centers` and `sphere_radii`.
+        observation: Posed in the world in which the robot's base stands, and labelled if it
+            will be.
+        robot: A `Robot`; of anything else its `sphere_centers` and `sphere_radii` count.
         q: (dof,) radians or metres.
-        padding: Metres added to every radius; see `ignore_robot`.
+        padding: Metres beyond the solids in which a pixel still sees the robot: the error of
+            the camera's pose, and of the URDF.
+        room: Metres around the collision spheres, or None for no such word.
         remove_flying: See `ignore_robot`.
+
+    Returns:
+        The observation with `robot_spheres` set, and `warnings` of what is odd.
 
     Raises:
         RobotError: q is not a configuration of the robot.
         ObservationError: the observation is not posed, so nobody knows where the robot is.
+        ConfigError: a padding or room that is negative or not finite.
     """
     import torch
 
+    _check_metres("padding", padding)
+    _check_metres("room", 0.0 if room is None else room)
     if not observation.posed:
         raise ObservationError(
             "the observation has no T_world_camera, so the robot cannot be placed in it; give "
             "its pose, or ignore_robot with centres in the camera frame"
         )
-    configuration = torch.as_tensor(np.asarray(q, dtype=np.float64))
-    return ignore_robot(
-        observation,
-        robot.sphere_centers(configuration),
-        robot.sphere_radii,
-        padding,
-        remove_flying=remove_flying,
-    )
+    centers = robot.sphere_centers(torch.as_tensor(np.asarray(q, dtype=np.float64)))
+    if not hasattr(robot, "solid_balls"):
+        return ignore_robot(
+            observation, centers, robot.sphere_radii, padding,
+            room=room or 0.0, remove_flying=remove_flying,
+        )  # fmt: skip
+    solid = robot.solid_balls(q)
+    said: list[str] = []
+    marked = observation
+    if len(solid.spheres):
+        rows = solid.spheres
+        marked = _with_balls(marked, rows[:, :3], rows[:, 3] + padding, rows[:, 3])
+        said.append(
+            f"the links {list(solid.without)} have no solids that can be read, so their collision "
+            "spheres, which may stand out of them, are taken for the pictured robot; give them "
+            "<collision> geometry or a mesh"
+        )
+    inner = solid.inner
+    noise = 3.0 * depth_noise(_in_camera(observation, inner[:, :3])[:, 2])
+    marked = _with_balls(marked, inner[:, :3], inner[:, 3] + padding + noise, inner[:, 3])
+    if room is not None:
+        places, sizes = to_numpy(centers, "centers"), to_numpy(robot.sphere_radii, "radii")
+        marked = _with_balls(marked, places, np.zeros(len(sizes)), sizes + room)
+        said.append(
+            f"hidden space within the pictured robot's collision spheres and {room:g} m around "
+            "them counts as free by your word (room)"
+        )
+    rows = np.column_stack([_in_camera(observation, inner[:, :3]), inner[:, 3]])
+    marked = _without_own_labels(marked, rows, noise + _EDGES)
+    said += _seen_through(observation, rows, padding + noise)
+    marked = replace(marked, warnings=(*marked.warnings, *said))
+    return _finished(observation, marked, remove_flying)
+
+
+def _check_metres(name: str, value: float) -> None:
+    if not (np.isfinite(value) and value >= 0.0):
+        raise ConfigError(f"{name} is {value}; it must be 0 or more (metres)")
+
+
+def _in_camera(observation: Observation, places: Float[np.ndarray, "s 3"]) -> np.ndarray:
+    return transform_points(invert_transform(observation.pose), places)
+
+
+def _with_balls(
+    observation: Observation,
+    places: Float[np.ndarray, "s 3"],
+    radii: Float[np.ndarray, " s"],
+    free: Float[np.ndarray, " s"],
+) -> Observation:
+    """The observation with balls of a robot (world, metres) added to those that it has."""
+    rows = np.column_stack([_in_camera(observation, places), radii, free])
+    before = observation.robot_spheres
+    if before is not None:
+        rows = np.vstack([before[:, [0, 1, 2, 3, -1]], rows])
+    return replace(observation, robot_spheres=rows)
+
+
+def _without_own_labels(
+    observation: Observation, inner: Float[np.ndarray, "s 4"], thick: Float[np.ndarray, " s"]
+) -> Observation:
+    """Take away the labels that are the robot's.
+
+    Args:
+        observation: what was seen.
+        inner: balls that fill the robot's solids, camera frame, metres.
+        thick: metres to either side that count as a solid's surface.
+    """
+    if observation.labels is None:
+        return observation
+    labels = observation.labels.copy()
+    points = backproject(observation.depth, observation.intrinsics)
+    outer, core = (np.column_stack([inner[:, :3], inner[:, 3] + t]) for t in (thick, -thick))
+    for label in observation.object_ids:
+        own = points[(labels == label) & (observation.depth > 0)]
+        on_surface = within_balls(own, outer)
+        on_surface[on_surface] = ~within_balls(own[on_surface], core)
+        if on_surface.mean() >= _OWN_SHARE:
+            labels[labels == label] = 0
+    return replace(observation, labels=labels)
+
+
+def _labels_on_robot(observation: Observation) -> list[str]:
+    """Say which objects are seen in or on the robot."""
+    said = []
+    for label in observation.object_ids:
+        own = (observation.labels == label) & (observation.depth > 0)
+        points = backproject(observation.depth, observation.intrinsics)[own]
+        share = float(within_balls(points, observation.robot_spheres[:, :4]).mean())
+        if share > _MANY:
+            said.append(
+                f"{share:.0%} of object {label} is seen in or on the pictured robot, and it stays "
+                "an obstacle; if it is the robot or what that holds, set its label to 0"
+            )
+    return said
+
+
+def _seen_through(
+    observation: Observation, inner: Float[np.ndarray, "s 4"], tolerance: Float[np.ndarray, " s"]
+) -> list[str]:
+    """Whether the camera saw past places where the robot should have been."""
+    pixels, depth = project(inner[:, :3], observation.intrinsics)
+    inside = (depth > 0) & (np.nan_to_num(pixels, nan=-1.0) >= 0).all(axis=1)
+    column, row = np.rint(pixels[inside]).astype(np.int64).T
+    kept = (row < observation.shape[0]) & (column < observation.shape[1])
+    seen = np.asarray(observation.depth, dtype=np.float64)[row[kept], column[kept]]
+    past = seen > (depth + inner[:, 3] + tolerance)[inside][kept]
+    if not (seen > 0).any() or past[seen > 0].mean() <= _SEEN_THROUGH:
+        return []
+    return [
+        f"the camera saw through {past[seen > 0].mean():.0%} of the places in the image that the "
+        "robot should have filled; check q, base_pose and T_world_camera"
+    ]
+
+
+def _finished(before: Observation, marked: Observation, remove_flying: bool) -> Observation:
+    said = dict.fromkeys([*marked.warnings, *_labels_on_robot(marked)])
+    marked = replace(marked, warnings=tuple(said))
+    if remove_flying:
+        flying = _flying_outline(marked)
+        marked = replace(marked, depth=np.where(flying, 0.0, marked.depth))
+        logger.info("%d flying pixels along the robot's outline removed", int(flying.sum()))
+    logger.info("%d pixels see the robot", int(marked.sees_robot.sum()))
+    own = sorted(set(before.object_ids) - set(marked.object_ids))
+    if own:
+        logger.warning("objects %s are the pictured robot: they are ignored with it", own)
+    return marked
 
 
 def _flying_outline(observation: Observation) -> Bool[np.ndarray, "h w"]:
@@ -147,13 +298,3 @@ def _flying_outline(observation: Observation) -> Bool[np.ndarray, "h w"]:
     # In place of height over a plane, which may be unknown: every jump in depth counts.
     image = surface_image(observation.depth, observation.intrinsics, observation.depth)
     return np.asarray(flying_pixels(image) & beside)
-
-
-def _report(before: Observation, after: Observation) -> None:
-    """Log what the robot covers; an object that vanishes under it is worth a warning."""
-    logger.info("%d pixels see the robot", int(after.sees_robot.sum()))
-    lost = sorted(set(before.object_ids) - set(after.object_ids))
-    if lost:
-        logger.warning(
-            "every pixel of objects %s lies on the robot: they are ignored with it", lost
-        )

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,15 +23,39 @@ from vprism_plan.robots._torch_kinematics import TorchKinematics
 _logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of a mesh, metres."""
+
+    corners: Float[np.ndarray, "f 3 3"]
+
+    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+        """As of a link's `MeshFile`."""
+        return self.corners
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Shape of an attached object in its own frame.
+
+    Attributes:
+        spheres: rows (x, y, z, radius) that hold it, metres.
+        surface: its mesh, if one was given.
+    """
+
+    spheres: Float[np.ndarray, "n 4"]
+    surface: Surface | None = None
+
+
 def attached(
     robot: Any,
     name: str,
     link: str,
-    rows: Float[np.ndarray, "n 4"],
+    held: Held,
     pose: Any,
     touch_links: Sequence[str],
 ) -> Any:
-    """See :meth:`Robot.attach`; ``rows`` are the object's spheres in its own frame."""
+    """See :meth:`Robot.attach`."""
     what = described(name)
     if not isinstance(name, str) or not name or name in robot._links or name in robot.groups:
         raise RobotError(f"{what}: an object needs a name of its own, no link's or group's")
@@ -46,7 +71,7 @@ def attached(
     for touched in (member for entry in touch_links for member in _members(robot, entry)):
         reasons.setdefault(touched, "Touch link")
     untested = [i for i, other in enumerate(robot.link_names) if other in reasons]
-    arrays = with_link(robot.arrays, sits, rows, untested)
+    arrays = with_link(robot.arrays, sits, held.spheres, untested)
     names = (*robot.link_names, name)
     touching = [p for p in touching_pairs(arrays, robot.neutral, names) if name in p]
     if touching:
@@ -62,6 +87,7 @@ def attached(
         | {frozenset((name, other)): reason for other, reason in reasons.items()},
         arrays=arrays,
         attached=robot.attached | {name: link},
+        held=robot.held | {name: held},
         _links=robot._links | {name: sits},
         _torch=TorchKinematics(arrays),
     )
@@ -81,6 +107,7 @@ def detached(robot: Any, name: str) -> Any:
         disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if name not in p},
         arrays=arrays,
         attached={other: link for other, link in robot.attached.items() if other != name},
+        held={other: shape for other, shape in robot.held.items() if other != name},
         _links={link: sits for link, sits in robot._links.items() if link != name},
         _torch=TorchKinematics(arrays),
     )
@@ -91,10 +118,8 @@ def described(name: str) -> str:
     return f"attached object {name!r}"
 
 
-def object_spheres(
-    name: str, spheres: Any, mesh: Any, max_spheres: int
-) -> Float[np.ndarray, "n 4"]:
-    """Rows (x, y, z, radius) from whichever of the two is given.
+def held_object(name: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
+    """The shape of an object from its spheres or its mesh.
 
     Raises:
         RobotError: Neither or both are given, or what is given is unusable.
@@ -103,10 +128,11 @@ def object_spheres(
     if (spheres is None) == (mesh is None):
         raise RobotError(f"{what}: give either spheres or a mesh")
     if mesh is None:
-        return sphere_rows(spheres, what)
+        return Held(sphere_rows(spheres, what))
     if max_spheres < 1:
         raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
-    return mesh_spheres(read_triangles(mesh, what), max_spheres)
+    triangles = read_triangles(mesh, what)
+    return Held(mesh_spheres(triangles, max_spheres), Surface(triangles))
 
 
 def _members(robot: Any, name: str) -> tuple[str, ...]:

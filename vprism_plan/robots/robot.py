@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 
 from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import _attached, _frames, _padding
+from vprism_plan.robots import _attached, _frames, _inner_balls, _padding
 from vprism_plan.robots._arrays import KinematicArrays
 from vprism_plan.robots._build import Request, robot_fields
 from vprism_plan.robots._geometry import PrimitiveGeometry
+from vprism_plan.robots._inner_balls import SolidBalls
 from vprism_plan.robots._matrix import (
     RIGID,
     SAMPLES,
@@ -80,6 +81,7 @@ class Robot:
             ``link_spheres``.
         meshes_as_read: ``meshes`` of all links, scaled and padded ones too.
         attached: Name of each attached object -> the link that carries it.
+        held: Name of each attached object -> its shape.
     """
 
     name: str
@@ -108,6 +110,7 @@ class Robot:
     # Link -> metres that the file of its spheres wants it to grow by; in `arrays` already.
     _file_padding: dict[str, float] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
+    held: dict[str, _attached.Held] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         make_read_only(self.__dict__)
@@ -305,6 +308,21 @@ class Robot:
             poses[link] = frame @ sits.T
         return poses
 
+    def solid_balls(self, q: Any) -> SolidBalls:
+        """What the robot itself fills: balls inside its solids, where collision spheres hold them.
+
+        From the collision geometry of the URDF and the meshes of attached objects as they
+        are: padding and scale do not count. Meshes are read; a second or two for an arm, kept
+        for other configurations.
+
+        Args:
+            q: (dof,) configuration.
+
+        Raises:
+            RobotError: See :meth:`check_configuration`.
+        """
+        return _inner_balls.solid_balls(self, q)
+
     def random_configuration(self, rng: np.random.Generator) -> Float[np.ndarray, "dof"]:
         """A uniform configuration within the limits."""
         return rng.uniform(self.lower, self.upper)
@@ -410,8 +428,8 @@ class Robot:
         Raises:
             RobotError: The name is taken, a link is unknown, or the shape is unusable.
         """
-        rows = _attached.object_spheres(name, spheres, mesh, max_spheres)
-        return _attached.attached(self, name, link, rows, pose, touch_links)
+        held = _attached.held_object(name, spheres, mesh, max_spheres)
+        return _attached.attached(self, name, link, held, pose, touch_links)
 
     def detach(self, name: str) -> Robot:
         """The same robot without an attached object.

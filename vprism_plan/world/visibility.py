@@ -7,7 +7,7 @@ of the cell's far side. So shadows are never too small, whatever the cell's size
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -17,8 +17,9 @@ from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.strays import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
-from vprism_plan.perception.camera import transform_points
+from vprism_plan.perception.balls import within_balls
 from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.pictured import cells_within, free_balls, speaking_against
 
 # Codes of points.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
@@ -27,9 +28,6 @@ _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
 THIN = 0.003
-# Cells around the robot that it takes with it. Inside a cavity of occluded cells a field
-# whose nodes are two cells apart falls short of the distance by 2.8 cells at most.
-_ROOM = 2.0
 
 
 def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -62,7 +60,9 @@ class View:
             2^k x 2^k window that begins at (v, u) of depth plus tolerance; infinite
             where there is no return or the support plane was seen.
         holes: the same, 0 where there is no return and 1 elsewhere.
-        robot: (S, 4) balls that held the robot, world, metres: nothing else is there.
+        robot: (S, 4) balls that held the robot, world, metres: nothing else is there ...
+        against: ... but behind what this view shows in or near any view's balls: like `reach`,
+            infinite elsewhere. None if there is nothing of the kind.
     """
 
     camera: Float[np.ndarray, "3 4"]
@@ -70,6 +70,7 @@ class View:
     reach: Float32[np.ndarray, "levels h w"]
     holes: Float32[np.ndarray, "levels h w"]
     robot: Float[np.ndarray, "s 4"] = field(default_factory=lambda: np.empty((0, 4)))
+    against: Float32[np.ndarray, "levels h w"] | None = None
 
 
 def _sparse_tables(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "levels h w"]:
@@ -87,8 +88,23 @@ def _sparse_tables(image: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "le
     return np.stack(tables)
 
 
-def make_view(observation: Observation, tolerance: float, plane: Plane | None = None) -> View:
+def make_views(
+    observations: Sequence[Observation], tolerance: float, plane: Plane | None = None
+) -> list[View]:
+    """Prepare observations of one scene; what one shows counts against the others' robots, too."""
+    robots = free_balls(observations)
+    return [make_view(observation, tolerance, plane, robots) for observation in observations]
+
+
+def make_view(
+    observation: Observation,
+    tolerance: float,
+    plane: Plane | None = None,
+    robots: Float[np.ndarray, "s 4"] | None = None,
+) -> View:
     """Prepare an observation; `tolerance` (metres) is how far behind a return shadow begins.
+
+    `robots` are the balls of the robots in all views of the scene; None: in this one.
 
     The tolerance grows with the noise of the sensor: three standard deviations. A ray
     that ends on the support plane (within that noise) or under it has passed through
@@ -109,14 +125,17 @@ def make_view(observation: Observation, tolerance: float, plane: Plane | None = 
             on_plane &= observation.labels[valid] == 0
         on_plane &= ~observation.sees_robot[valid]
         reach[valid] = np.where(on_plane, np.inf, reach[valid])
-    return _view(observation, reach, valid, _robot_balls(observation))
+    view, own = _view(observation, reach, valid), free_balls([observation])
+    things = np.isfinite(reach) & ~observation.sees_robot
+    against = speaking_against(observation, things, own if robots is None else robots)
+    tables = _sparse_tables(against.astype(np.float32)) if np.isfinite(against).any() else None
+    return replace(view, robot=own, against=tables)
 
 
 def _view(
     observation: Observation,
     reach: Float[np.ndarray, "h w"],
     valid: Bool[np.ndarray, "h w"],
-    robot: Float[np.ndarray, "s 4"],
 ) -> View:
     K, rotation = observation.intrinsics, observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
@@ -125,7 +144,6 @@ def _view(
         optics=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64),
         reach=_sparse_tables(reach.astype(np.float32)),
         holes=_sparse_tables(valid.astype(np.float32)),
-        robot=robot,
     )
 
 
@@ -141,18 +159,9 @@ def behind(
 
     Pixels with an infinite `start` hide nothing.
     """
-    view = _view(observation, start, np.ones(start.shape, dtype=bool), np.empty((0, 4)))
+    view = _view(observation, start, np.ones(start.shape, dtype=bool))
     status = classify_cells([view], plane, origin, spacing, shape)
     return (status == kernels.OCCLUDED) | (status == kernels.PARTLY)
-
-
-def _robot_balls(observation: Observation) -> Float[np.ndarray, "s 4"]:
-    """The observation's robot in world coordinates."""
-    if observation.robot_spheres is None:
-        return np.empty((0, 4))
-    spheres: np.ndarray = observation.robot_spheres.copy()
-    spheres[:, :3] = transform_points(observation.pose, spheres[:, :3])
-    return spheres
 
 
 def classify_cells_around(
@@ -190,10 +199,8 @@ def classify_cells(
 
     Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that
     sees a cell outweighs any number that do not. Cells wholly under the support plane
-    are called FREE: the half-space answers for them. So are cells whose centre was inside
-    the robot (`Observation.robot_spheres`) in any view, or within two cells of it: it was
-    there, so nothing else is, and what a field of these cells rounds away must not refuse
-    the robot the place where it stood.
+    are called FREE: the half-space answers for them. So are cells wholly in a ball of the
+    robot in any view, where no view shows something else before them (`pictured`).
     """
     status = np.full(shape, kernels.UNOBSERVED, dtype=np.uint8)
     blocks = -(-shape[0] // _BLOCK)
@@ -222,27 +229,35 @@ def classify_cells(
             shape[0],
             16,
         )
-    for view in views:
-        for ball in view.robot:
-            _clear_ball(ball[:3], float(ball[3]) + _ROOM * spacing, origin, spacing, status)
+    _clear_robots(views, origin, spacing, status)
     return status
 
 
-def _clear_ball(
-    middle: Float[np.ndarray, " 3"],
-    reach: float,
+def _clear_robots(
+    views: Sequence[View],
     origin: Float[np.ndarray, " 3"],
     spacing: float,
     status: UInt8[np.ndarray, "nx ny nz"],
 ) -> None:
-    """Call the cells whose centre lies in a ball free."""
-    center, radius = (middle - origin) / spacing - 0.5, reach / spacing
-    low = np.clip(np.ceil(center - radius), 0, status.shape).astype(np.int64)
-    high = np.clip(np.floor(center + radius) + 1, low, status.shape).astype(np.int64)
-    x, y, z = (np.arange(a, b) - c for a, b, c in zip(low, high, center, strict=True))
-    square = x[:, None, None] ** 2 + y[:, None] ** 2 + z**2
-    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    status[window][square <= radius**2] = kernels.FREE
+    """Call the cells free in which a pictured robot was."""
+    balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+    if not len(balls):
+        return
+    window, robot = cells_within(balls, origin, spacing, status.shape)
+    part = status[window]
+    robot &= part != kernels.FREE
+    if not robot.any():
+        return
+    corner = origin + spacing * np.array([w.start for w in window])
+    for view in views:
+        if view.against is not None:
+            code = np.full(part.shape, kernels.UNOBSERVED, dtype=np.uint8)
+            kernels.classify_cells(
+                corner, spacing, view.camera, view.optics, view.against, view.holes, code,
+                0, -(-part.shape[0] // _BLOCK),
+            )  # fmt: skip
+            robot &= (code != kernels.OCCLUDED) & (code != kernels.PARTLY)
+    part[robot] = kernels.FREE
 
 
 def classify_points(
@@ -255,10 +270,18 @@ def classify_points(
         kernels.classify_points(
             points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
         )
+    balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+    hidden = np.flatnonzero(status != kernels.FREE) if len(balls) else np.empty(0, dtype=int)
+    robot = hidden[within_balls(points[hidden], balls)]
     for view in views:
-        for ball in view.robot:
-            square = ((points - ball[:3]) ** 2).sum(axis=1)
-            status[square <= ball[3] ** 2] = kernels.FREE
+        if view.against is not None and len(robot):
+            code = np.full(len(robot), kernels.UNOBSERVED, dtype=np.uint8)
+            kernels.classify_points(
+                points[robot], view.camera, view.optics, view.against, view.holes, code,
+                0, len(robot),
+            )  # fmt: skip
+            robot = robot[(code != kernels.OCCLUDED) & (code != kernels.PARTLY)]
+    status[robot] = kernels.FREE
     return _OF_POINT[status]
 
 

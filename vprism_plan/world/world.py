@@ -106,7 +106,6 @@ class World:
             *(f"known:{k.name}" for k in solids),
         )
         self.plane_names, self.planes = self._half_spaces()
-        choose_grid(map, self.config, None)  # tracing for a grid too large even so takes minutes
         self._factor = lattice_refinement(self.config.resolution, map.kernel_length)
         fine = self.config.resolution / self._factor
         self._level_set = self._timed("level set", trace_level_set, map, fine, self.config.level)
@@ -114,15 +113,12 @@ class World:
         self.grid: Grid = choose_grid(
             map, self.config, None if box is None else (box[0] * fine, box[1] * fine)
         )
-        self._views = [
-            visibility.make_view(view, self.config.occlusion_tolerance, map.plane)
-            for view in map.views
-        ]
+        tolerance = self.config.occlusion_tolerance
+        self._views = visibility.make_views(map.views, tolerance, map.plane)
         self._below: list[visibility.View] | None = None
         self._support: SeenSupport | None = None
         if self._bounded:
-            tolerance = self.config.occlusion_tolerance
-            self._below = [visibility.make_view(view, tolerance) for view in map.views]
+            self._below = visibility.make_views(map.views, tolerance)
             self._support = seen_support(map.views, map.plane)
         self._objects: NodeDistances = self._timed(
             "distance to objects", self._object_distances, None
