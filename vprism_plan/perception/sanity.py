@@ -3,12 +3,14 @@
 
 from collections.abc import Sequence
 
+from vprism_plan.perception.masks import mend
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
+from vprism_plan.perception.several_views import agree
 
 
 def examine(
-    views: Sequence[Observation], plane: Plane
+    views: Sequence[Observation], plane: Plane, earlier: Sequence[Observation] = ()
 ) -> tuple[tuple[Observation, ...], tuple[str, ...]]:
     """Return views fit for use, and what was odd about them.
 
@@ -17,6 +19,7 @@ def examine(
     Args:
         views: posed as the map will have them.
         plane: support surface, world frame.
+        earlier: views of the same scene that went through this before.
 
     Returns:
         The views, mended where that was possible, and one sentence for each finding: what is
@@ -25,5 +28,6 @@ def examine(
     Raises:
         ObservationError: a view that cannot be right.
     """
+    views = agree(mend(views, plane, len(earlier)), earlier)
     found = [text for view in views for text in view.warnings]
     return tuple(views), tuple(dict.fromkeys(found))

@@ -17,7 +17,7 @@ from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.strays import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
-from vprism_plan.perception.camera import transform_points
+from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points
 
 # Codes of points.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
@@ -29,25 +29,6 @@ _THIN = 0.003
 # Cells around the robot that it takes with it. Inside a cavity of occluded cells a field
 # whose nodes are two cells apart falls short of the distance by 2.8 cells at most.
 _ROOM = 2.0
-
-
-def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
-
-    Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise" (3DIMPVT 2012), eq. 3.
-    """
-    return 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
-
-
-def _height_sigma(
-    view: Observation,
-    points: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    plane: Plane,
-) -> Float[np.ndarray, " n"]:
-    """Standard deviation of the depth noise as it shows along the plane's normal, metres."""
-    slope = np.abs((points - view.camera_center) @ plane.normal) / depth
-    return np.asarray(depth_sigma(depth) * slope)
 
 
 @dataclass(frozen=True)
@@ -101,7 +82,7 @@ def make_view(observation: Observation, tolerance: float, plane: Plane | None = 
     reach = np.where(valid, depth + np.maximum(tolerance, 3.0 * depth_sigma(depth)), np.inf)
     if plane is not None:
         points = observation.point_image()[valid]
-        sigma = _height_sigma(observation, points, depth[valid], plane)
+        sigma = height_sigma(points - observation.camera_center, depth[valid], plane.normal)
         # Four, not three: one pixel in 700 would leave a speck on every open table.
         threshold = np.maximum(_THIN, 4.0 * sigma)
         on_plane = plane.signed_distance(points) < threshold
@@ -242,7 +223,8 @@ def background_points(
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
         chosen = (labels == 0) & ~view.sees_robot[view.depth > 0]
         if plane is not None:
-            threshold = np.maximum(height, 3.0 * _height_sigma(view, points, depth, plane))
+            sigma = height_sigma(points - view.camera_center, depth, plane.normal)
+            threshold = np.maximum(height, 3.0 * sigma)
             off = plane.signed_distance(points) > threshold
             chosen &= off
             if lone_share > 0.0:
