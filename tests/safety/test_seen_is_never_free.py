@@ -10,7 +10,7 @@ import pytest
 from oracles.perception_oracles import Scene, intrinsics, look_at
 
 import vprism_plan as vp
-from vprism_plan.world.visibility import depth_sigma
+from vprism_plan.perception.camera import depth_sigma
 
 K = intrinsics()
 RADIUS = 0.005

@@ -21,6 +21,7 @@ from vprism_plan.mapping.posterior import VPrismMap
 from vprism_plan.mapping.priors import expand_prior, weight_prior
 from vprism_plan.mapping.strays import stray_points
 from vprism_plan.mapping.subsampling import grid_subsample
+from vprism_plan.perception.masks import drop_background
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane
@@ -68,13 +69,22 @@ def fit_map(
         PlaneNotFoundError: no support plane is known and none can be fitted.
         MapError: the objects would need too many hinge points, or the seed is none.
     """
-    config = MapConfig() if config is None else config
+    return _fit(observations, MapConfig() if config is None else config, seed)
+
+
+def _fit(
+    observations: Observation | Sequence[Observation],
+    config: MapConfig,
+    seed: int,
+    known: Sequence[str] = (),
+) -> VPrismMap:
+    """`fit_map`; `known` are warnings of an earlier map of some of the views."""
     problem = learning_problem(observations, config, seed)
     prior = weight_prior(problem.space, config, len(problem.object_ids) + 1)
     posterior = _learn(problem.space, problem.data, prior, config)
     return VPrismMap(
         config, problem.object_ids, problem.plane, problem.views, problem.space, posterior, seed,
-        problem.warnings,
+        tuple(dict.fromkeys([*known, *problem.warnings])),
     )  # fmt: skip
 
 
@@ -109,9 +119,10 @@ def learning_problem(
     views = _views(observations)
     if not (is_whole(seed) and seed >= 0):
         raise MapError(f"seed is {seed!r}; it must be a whole number from 0")
-    object_ids = _object_ids(views)
+    views = _usable(views)
     plane = _support_plane(views, seed)
     views, warnings = examine(views, plane)
+    object_ids = _object_ids(views)
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
     space = FeatureSpace(
@@ -119,6 +130,7 @@ def learning_problem(
         config.gamma,
         config.cutoff_radius,
     )
+    warnings = (*warnings, *_without_return(views, object_ids))
     return LearningProblem(views, object_ids, plane, data, space, warnings)
 
 
@@ -141,14 +153,17 @@ def _views(observations: Any) -> tuple[Observation, ...]:
 
 def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     """See `VPrismMap.update`."""
+    if not isinstance(observation, Observation):
+        raise ObservationError(f"update got a {type(observation).__name__}; give one Observation")
+    config, plane = old.config, old.plane
+    (observation,) = _usable((observation,), old.views)
+    (observation,), found = examine((observation,), plane, old.views)
     seen = _object_ids((observation,))
     views = (*old.views, observation)
     if not set(seen) <= set(old.object_ids):
         logger.info("new objects in the view: all %d views are fitted together", len(views))
-        return fit_map(views, old.config, old.seed)
-    config, plane = old.config, old.plane
-    (observation,), found = examine((observation,), plane)
-    views = (*old.views, observation)
+        return _fit(views, config, old.seed, old.warnings)
+    found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
     candidates = new_hinges(data, seen, views, plane, config, rng)
@@ -298,26 +313,43 @@ def _check_hinge_count(count: int, config: MapConfig) -> None:
         )
 
 
-def _object_ids(views: Sequence[Observation]) -> tuple[int, ...]:
+def _usable(
+    views: Sequence[Observation], earlier: Sequence[Observation] = ()
+) -> tuple[Observation, ...]:
+    """Return views of one world frame, without labels that are no object."""
     if not views:
         raise ObservationError("no observation given; fit_map needs at least one view")
-    for view in views:
-        if not isinstance(view, Observation):
-            raise ObservationError(
-                f"fit_map got a {type(view).__name__}; pass an Observation or a list of them"
-            )
-    if len(views) > 1 and not all(view.posed for view in views):
+    posed = {view.posed for view in (*earlier, *views)}
+    if len(posed) > 1 or (len(views) > 1 and False in posed):
         raise ObservationError(
             "several views need T_world_camera each; without it their frames differ"
         )
-    found: set[int] = set()
     for view in views:
-        found.update(view.require_objects())
-        labelled = np.unique(view.labels)
-        lost = [int(i) for i in labelled if i > 0 and int(i) not in view.object_ids]
-        if lost:
-            logger.warning("objects %s have no depth return and are not in the map", lost)
-    return tuple(sorted(found))
+        view.require_objects()
+    views = drop_background(views, len(earlier))
+    _object_ids(views)
+    return views
+
+
+def _object_ids(views: Sequence[Observation]) -> tuple[int, ...]:
+    """Labels of the objects; every view shows at least one."""
+    return tuple(sorted({i for view in views for i in view.require_objects()}))
+
+
+def _without_return(views: Sequence[Observation], object_ids: tuple[int, ...]) -> list[str]:
+    """Name the objects that carry a label and are in no map: no pixel of theirs has depth."""
+    pixels: dict[int, int] = {}
+    for view in views:
+        ids, counts = np.unique(view.labels[view.labels > 0], return_counts=True)
+        for i, count in zip(ids.tolist(), counts.tolist(), strict=True):
+            if i not in object_ids:
+                pixels[i] = pixels.get(i, 0) + count
+    return [
+        f"object {i} is not in the map: none of its {count} pixels has a depth return of its "
+        "own; the rays through them count as an obstacle, take another view if it is of glass, "
+        "black or shiny"
+        for i, count in sorted(pixels.items())
+    ]
 
 
 def _support_plane(views: Sequence[Observation], seed: int) -> Plane:

@@ -48,6 +48,29 @@ def project(
     return np.stack([u, v], axis=1), z
 
 
+def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
+
+    Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise" (3DIMPVT 2012), eq. 3.
+    """
+    return 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
+
+
+def height_sigma(
+    rays: Float[np.ndarray, "n 3"],
+    depth: Float[np.ndarray, " n"],
+    normal: Float[np.ndarray, " 3"],
+) -> Float[np.ndarray, " n"]:
+    """Standard deviation of the depth noise as it shows along a surface's normal, metres.
+
+    Args:
+        rays: from the camera to what it saw, metres, in the frame of `normal`.
+        depth: of these points, metres.
+        normal: unit vector.
+    """
+    return np.asarray(depth_sigma(depth) * (np.abs(rays @ normal) / depth))
+
+
 def transform_points(
     transform: Float[np.ndarray, "4 4"], points: Num[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 3"]:

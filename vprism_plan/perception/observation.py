@@ -142,9 +142,10 @@ class Observation:
                 if (self.labels > 0).any()
                 else "every label is 0 (background)"
             )
+            noted = "".join(f" ({text})" for text in self.warnings)
             raise ObservationError(
                 f"the observation shows no object: {where}; objects need positive labels, "
-                "or use segment_tabletop(obs)"
+                f"or use segment_tabletop(obs){noted}"
             )
         return self.object_ids
 

@@ -11,9 +11,11 @@ from scipy import ndimage
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception._ransac import least_squares_plane
 from vprism_plan.perception.camera import pixel_rays
+from vprism_plan.perception.masks import mend
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import inlier_band
+from vprism_plan.perception.several_views import agree
 
 _TILTED, _NO_TABLE = 15.0, 45.0  # degrees off the world's z: named, refused
 _HIGHEST = 6.0  # metres that a camera can be above the surface it looks at
@@ -32,7 +34,7 @@ _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def examine(
-    views: Sequence[Observation], plane: Plane
+    views: Sequence[Observation], plane: Plane, earlier: Sequence[Observation] = ()
 ) -> tuple[tuple[Observation, ...], tuple[str, ...]]:
     """Return views fit for use, and what was odd about them.
 
@@ -41,6 +43,7 @@ def examine(
     Args:
         views: posed as the map will have them.
         plane: support surface, world frame.
+        earlier: views of the same scene that went through this before.
 
     Returns:
         The views, mended where that was possible, and one sentence for each finding: what is
@@ -53,6 +56,7 @@ def examine(
     for view in views:
         found += [*_pose(view, plane), *_lens(view), *_bend(view, plane), *_sizes(view)]
     views = tuple(_without_what_is_behind_the_surface(view, plane) for view in views)
+    views = agree(mend(views, plane, len(earlier)), earlier)
     found += [text for view in views for text in view.warnings]
     return views, tuple(dict.fromkeys(found))
 

@@ -15,8 +15,9 @@ from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.strays import stray_points
 from vprism_plan.perception import Observation, Plane
+from vprism_plan.perception.camera import height_sigma
 from vprism_plan.world.grid import Grid
-from vprism_plan.world.visibility import THIN, beside, height_sigma
+from vprism_plan.world.visibility import THIN, beside
 
 _STRAY_SHARE = 0.03  # as in the default map: fewer neighbours than this is a flying pixel
 _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point may be free
@@ -55,7 +56,7 @@ def surface_points(
             own = np.flatnonzero(labels == object_id)
             own = own[beside(points[own], ~stray_points(points[own], _STRAY_SHARE))]
             if plane is not None:
-                sigma = height_sigma(view, points[own], depth[own], plane)
+                sigma = height_sigma(points[own] - view.camera_center, depth[own], plane.normal)
                 height = plane.signed_distance(points[own])
                 height = np.abs(height) if bounded else height
                 own = own[height > np.maximum(THIN, 3.0 * sigma)]

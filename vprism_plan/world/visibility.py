@@ -18,6 +18,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.strays import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.balls import within_balls
+from vprism_plan.perception.camera import depth_sigma, height_sigma
 from vprism_plan.world.config import WorldConfig
 from vprism_plan.world.pictured import cells_within, free_balls, speaking_against
 
@@ -28,25 +29,6 @@ _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
 THIN = 0.003
-
-
-def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
-
-    Nguyen, Izadi and Lovell, "Modeling Kinect sensor noise" (3DIMPVT 2012), eq. 3.
-    """
-    return 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
-
-
-def height_sigma(
-    view: Observation,
-    points: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    plane: Plane,
-) -> Float[np.ndarray, " n"]:
-    """Standard deviation of the depth noise as it shows along the plane's normal, metres."""
-    slope = np.abs((points - view.camera_center) @ plane.normal) / depth
-    return np.asarray(depth_sigma(depth) * slope)
 
 
 @dataclass(frozen=True)
@@ -117,7 +99,7 @@ def make_view(
     reach = np.where(valid, depth + np.maximum(tolerance, 3.0 * depth_sigma(depth)), np.inf)
     if plane is not None:
         points = observation.point_image()[valid]
-        sigma = height_sigma(observation, points, depth[valid], plane)
+        sigma = height_sigma(points - observation.camera_center, depth[valid], plane.normal)
         # Four, not three: one pixel in 700 would leave a speck on every open table.
         threshold = np.maximum(THIN, 4.0 * sigma)
         on_plane = plane.signed_distance(points) < threshold
@@ -322,7 +304,8 @@ def clutter_pixels(
     depth = np.asarray(view.depth, dtype=np.float64)[valid]
     chosen = (labels == 0) & ~view.sees_robot[valid]
     if plane is not None:
-        threshold = np.maximum(height, 3.0 * height_sigma(view, points, depth, plane))
+        sigma = height_sigma(points - view.camera_center, depth, plane.normal)
+        threshold = np.maximum(height, 3.0 * sigma)
         away = plane.signed_distance(points)
         off = (np.abs(away) if bounded else away) > threshold
         chosen &= off

@@ -28,11 +28,12 @@ from vprism_plan.evaluation.planning_benchmark.grid_world import (
 )
 from vprism_plan.evaluation.protocols import TrueScene
 from vprism_plan.mapping.strays import stray_points
+from vprism_plan.perception.camera import depth_sigma
 from vprism_plan.robots import Robot
 from vprism_plan.world import Grid, World, WorldConfig
 from vprism_plan.world.config import OccludedPolicy
 from vprism_plan.world.distance import Lattice
-from vprism_plan.world.visibility import background_points, depth_sigma
+from vprism_plan.world.visibility import background_points
 
 __all__ = ["Bench", "known_nodes"]
 
