@@ -17,7 +17,6 @@ from vprism_plan.collision import compare
 ROUNDS = 7
 CONFIGURATIONS = 100
 COMPARED = 2000
-STEP = 0.005  # metres between the configurations of a path
 
 
 def timed(call) -> tuple[float, object]:
@@ -57,7 +56,7 @@ def main() -> None:
     }
     for name, judge in meshes.items():
         calls[f"{name}: is_valid"] = lambda j=judge: [j.is_valid(q) for q in near]
-        calls[f"{name}: distance"] = lambda j=judge: [j.distance(q) for q in near]
+        calls[f"{name}: clearance"] = lambda j=judge: [j.clearance(q) for q in near]
     median_us(calls)  # warm up
     result = median_us(calls)
     print(f"Panda in the demo scene, {CONFIGURATIONS} free configurations near obstacles")
@@ -65,11 +64,11 @@ def main() -> None:
         faces = sum(len(mesh.faces) for mesh in judge.surfaces.meshes.values())
         print(f"  {name:28s} {len(judge.solids)} shapes, {faces} triangles, {build[name]:.1f} s")
     for name, value in result.items():
-        base = "field clearance" if name.endswith("distance") else "field is_valid"
+        base = "field clearance" if name.endswith("clearance") else "field is_valid"
         print(f"  {name:32s} {value:9.1f} us   {value / result[base]:7.0f} x {base}")
     judge = meshes["solids, 2.5 mm mesh"]
     path = near[:2]
-    seconds, opinion = timed(lambda: judge.review(checker, path, STEP))
+    seconds, opinion = timed(lambda: judge.review(checker, path))
     print(f"review of one edge: {opinion.configurations} configurations, {seconds:.2f} s")
     sample = rng.uniform(robot.lower, robot.upper, (COMPARED, robot.dof))
     for name in ("solids, 2.5 mm mesh", "spheres, 2.5 mm mesh"):

@@ -175,9 +175,9 @@ def test_draws_are_copied_while_another_thread_bakes_them(map_):
 @pytest.mark.parametrize("duplicate", [deep, pickled])
 def test_mesh_checkers_are_copied(fresh, Q, duplicate):
     pytest.importorskip("fcl")
-    checker = vp.MeshChecker(fresh().world, fresh().robot, allowed_contacts={}, resolution=0.02)
+    checker = vp.MeshChecker(fresh().world, fresh().robot, resolution=0.02)
     other = duplicate(checker)
-    assert [other.distance(q) for q in Q[:10]] == [checker.distance(q) for q in Q[:10]]
+    assert [other.clearance(q) for q in Q[:10]] == [checker.clearance(q) for q in Q[:10]]
     assert [other.is_valid(q) for q in Q] == [checker.is_valid(q) for q in Q]
     assert other.links == checker.links
 

@@ -160,16 +160,18 @@ def test_occluded(seen, ball_robot):
     world, robot = vp.World(map_), ball_robot(0.01)
     behind = np.array([0.1, 0.0, 0.06])
     assert world.status(behind[None])[0] == 1
-    found, kinds = only(vp.CollisionChecker(world, robot), vp.MeshChecker(world, robot), behind)
+    checker = vp.CollisionChecker(world, robot)
+    found, kinds = only(checker, vp.MeshChecker(world, robot, seen=False), behind)
     assert kinds == {"occluded"}
     assert found.mesh_valid
     assert "no camera saw" in found.causes[0].text()
+    assert compare(checker, vp.MeshChecker(world, robot), [behind]).both_refused == 1
 
 
 def test_background_and_thin_parts(seen, ball_robot):
     scene, map_ = seen
     world, robot = vp.World(map_, vp.WorldConfig(occluded="free")), ball_robot(0.004)
-    checker, meshes = vp.CollisionChecker(world, robot), vp.MeshChecker(world, robot)
+    checker, meshes = vp.CollisionChecker(world, robot), vp.MeshChecker(world, robot, seen=False)
     points, _ = scene.observation.points()
     _, bar, clutter = scene.solids
     on_clutter = points[(np.abs(clutter.signed_distance(points)) < 1e-3) & (points[:, 2] > 0.04)]
@@ -181,13 +183,41 @@ def test_background_and_thin_parts(seen, ball_robot):
     assert "thin seen part" in comparison.counts()
     assert set(comparison.counts()) <= {"thin seen part", "voxel inflation"}
     assert not comparison.mesh_refuses
+    # By the images, FCL's checker refuses all of them as well.
+    seen_points = np.concatenate([on_clutter[::120], missed])
+    assert compare(checker, vp.MeshChecker(world, robot), seen_points).both_refused == len(
+        seen_points
+    )
+
+
+def test_what_a_camera_saw_is_held_against_any_map(seen, ball_robot):
+    """The images have a say of their own: a field that lost a thing is told so."""
+    scene, map_ = seen
+    world, robot = vp.World(map_), ball_robot(0.004)
+    meshes, lost = vp.MeshChecker(world, robot), Free(world, robot)
+    points, _ = scene.observation.points()
+    _, bar, clutter = scene.solids
+    for solid, body in ((bar, "object:1"), (clutter, "background")):
+        there = points[(np.abs(solid.signed_distance(points)) < 1e-3) & (points[:, 2] > 0.05)]
+        (found,) = compare(lost, meshes, there[:1]).mesh_refuses
+        cause = next(c for c in found.causes if c.body == body)
+        assert cause.kind == "seen by a camera"
+        assert "missed what a camera saw" in cause.text()
+    behind = [0.1, 0.0, 0.06]
+    _, kinds = only(lost, meshes, behind)
+    assert kinds == {"missed by the field"}
+    (contact,) = meshes.contacts(behind)
+    assert contact.body == "occluded"
+    assert "no camera saw this space" in contact.text()
 
 
 def test_unobserved(ball_robot):
     world, robot = bounded(BLOB, unobserved="occupied"), ball_robot(0.01)
-    meshes = vp.MeshChecker(world, robot)
+    meshes = vp.MeshChecker(world, robot, seen=False)
     _, kinds = only(vp.CollisionChecker(world, robot), meshes, [0.12, 0.12, 0.12])
     assert kinds == {"unobserved"}
+    (contact,) = vp.MeshChecker(world, robot).contacts([0.12, 0.12, 0.12])
+    assert contact.body == "unobserved"
 
 
 def test_too_small_for_the_mesh(ball_robot):
@@ -207,7 +237,8 @@ def test_too_small_for_the_mesh(ball_robot):
 def test_contact_rules(blob, ball_robot, edge_of_blob, who):
     robot, rules = ball_robot(0.02), {"ball": {1}}
     config = vp.CheckerConfig(allowed_contacts=rules if who == "field" else {})
-    meshes = vp.MeshChecker(blob, robot, allowed_contacts={} if who == "field" else rules)
+    other = vp.CheckerConfig(allowed_contacts={} if who == "field" else rules)
+    meshes = vp.MeshChecker(blob, robot, other)
     q = [edge_of_blob + 0.01, 0.0, 0.0]
     found, kinds = only(vp.CollisionChecker(blob, robot, config), meshes, q)
     assert kinds == {"contact rules"}
@@ -300,9 +331,9 @@ def test_a_risk_that_refuses_is_named(blob, ball_robot):
 def test_what_both_refuse_is_the_tolerance_of_an_edge(blob, ball_robot, edge_of_blob):
     """Of a path: the edge was accepted to within its tolerance, the configuration is refused."""
     robot = ball_robot(0.02)
-    checker, meshes = vp.CollisionChecker(blob, robot), vp.MeshChecker(blob, robot)
+    checker, meshes = vp.CollisionChecker(blob, robot), vp.MeshChecker(blob, robot, step=0.001)
     path = np.array([[edge_of_blob + 0.019, y, 0.0] for y in (-0.2, 0.2)])
-    opinion = meshes.review(checker, path, step=0.001)
+    opinion = meshes.review(checker, path)
     assert not opinion.valid
     (found,) = opinion.findings
     assert {cause.kind for cause in found.causes} == {"edge tolerance"}

@@ -73,7 +73,9 @@ def bounded(map_, **options):
 
 def make(world, robot, **options):
     """Meshes coarser than the default: sooner made, and as good for what is tested here."""
-    return vp.MeshChecker(world, robot, resolution=0.008, **options)
+    allowed = options.pop("allowed_contacts", {})
+    config = vp.CheckerConfig(allowed_contacts=allowed, margin=options.pop("margin", 0.0))
+    return vp.MeshChecker(world, robot, config, resolution=0.008, **options)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,7 @@ def world(known):
 
 @pytest.fixture(scope="module")
 def checker(world, flyer):
-    return make(world, flyer)
+    return make(world, flyer, step=0.02)
 
 
 @dataclass
@@ -216,7 +218,7 @@ def test_verdicts_and_distances_are_those_of_the_formulas(world, flyer, padding)
     rng = np.random.default_rng(0)
     hits = misses = 0
     for q in near_things(rng, 80):
-        gap, distance = truth.gap(q), checker.distance(q)
+        gap, distance = truth.gap(q), checker.clearance(q)
         if abs(gap) < 2 * DENSE:
             continue
         if gap < 0:
@@ -244,7 +246,7 @@ def test_the_three_answers_agree_with_one_another(world, flyer, links):
         contacts = checker.contacts(q)
         assert checker.is_valid(q) == (not contacts)
         of_world = [c for c in contacts if c.kind not in {"self", "joint_limit"}]
-        assert (checker.distance(q) <= 0.0) == bool(of_world)
+        assert (checker.clearance(q) <= 0.0) == bool(of_world)
         depths = [contact.depth for contact in contacts]
         assert depths == sorted(depths, reverse=True)
         assert len({(c.link, c.body) for c in contacts}) == len(contacts)
@@ -256,6 +258,7 @@ def test_the_three_answers_agree_with_one_another(world, flyer, links):
             assert (contact.sphere >= 0) == (links == "spheres")
             assert (contact.link, contact.body) != ("arm", "object:1")
             assert (contact.probability is not None) == (contact.kind == "object")
+            assert contact.required == 0.0
 
 
 def test_spheres_are_judged_exactly(world, ball_robot):
@@ -278,7 +281,7 @@ def test_spheres_are_judged_exactly(world, ball_robot):
             _, (way,), _ = closest_point(mesh, q[None])
             held = pot.contains(q[None])[0] if i is None else owner == i
             best = min(best, (-way if held else way) - radius)
-        assert checker.distance(q) == pytest.approx(best, abs=5e-6)
+        assert checker.clearance(q) == pytest.approx(best, abs=5e-6)
         for contact in checker.contacts(q):
             assert contact.sphere == 0
             if contact.depth == pytest.approx(-best, abs=5e-6):
@@ -300,13 +303,13 @@ def test_what_is_wholly_inside_is_a_collision(world, ball_robot):
         small = make(world, ball_robot(0.001))
         for q in deep:
             assert not small.is_valid(q)
-            assert small.distance(q) < 0.0
+            assert small.clearance(q) < 0.0
             contact = next(c for c in small.contacts(q) if c.body == f"object:{i}")
             assert contact.depth > 0.001
             assert contact.probability is not None
     pot = next(k.mesh for k in world.config.known if isinstance(k, KnownMesh))
     assert small.contacts(pot.centroid)[0].body == "known:pot"
-    assert small.distance(pot.centroid) < -0.045
+    assert small.clearance(pot.centroid) < -0.045
 
 
 def test_an_open_known_mesh_is_only_its_surface(ball_robot):
@@ -373,7 +376,7 @@ def test_what_no_joint_moves_stands_on_the_world(flyer):
     checker = make(world, flyer)
     q = np.array([0.4, 0.4, 0.4, 0, 0, 0, 0])
     assert checker.is_valid(q)
-    assert checker.distance(q) > 0.05
+    assert checker.clearance(q) > 0.05
 
 
 def test_joint_limits_are_named(checker, flyer):
@@ -420,7 +423,7 @@ def test_a_link_mesh_of_a_box_answers_as_the_box(world, flyer):
     assert sum(solid.shape.hollow for solid in meshed.solids) == 2
     same = 0
     for q in near_things(np.random.default_rng(7), 100):
-        a, b = plain.distance(q), meshed.distance(q)
+        a, b = plain.clearance(q), meshed.clearance(q)
         if abs(a) > 1e-3 or abs(b) > 1e-3:
             assert (a > 0) == (b > 0)
             if a > 0:
@@ -443,7 +446,7 @@ def test_a_hollow_link_that_swallows_an_obstacle_is_a_collision(ball_robot):
     assert not checker.is_valid(around_pea)
     assert checker.contacts(around_pea)[0].body == "known:pea"
     assert {c.kind for c in checker.contacts(around_all)} == {"object"}
-    assert checker.distance(around_all) < 0.0
+    assert checker.clearance(around_all) < 0.0
     assert checker.is_valid([1.0, 1.0, 1.0])
     open_shell = shell.copy()
     open_shell.update_faces(np.arange(len(shell.faces)) > 2)
@@ -478,7 +481,7 @@ def test_no_point_moves_more_than_the_step_between_two_configurations(checker, f
     for _ in range(4):
         qa, qb = near_things(rng, 2)
         places = []
-        for t in checker._fractions(qa, qb, 0.02):
+        for t in checker._fractions(qa, qb):
             poses = flyer.link_poses(qa + t * (qb - qa))
             places.append(
                 np.concatenate(
@@ -497,10 +500,10 @@ def test_motions_and_paths_are_judged_by_their_configurations(checker):
     assert len(free) == 5
     verdicts = []
     for qa, qb in itertools.pairwise(free):
-        steps = [qa + t * (qb - qa) for t in checker._fractions(qa, qb, 0.02)]
+        steps = [qa + t * (qb - qa) for t in checker._fractions(qa, qb)]
         verdicts.append(all(checker.is_valid(q) for q in steps))
-        assert checker.check_motion(qa, qb, step=0.02) == verdicts[-1]
-    opinion = checker.check_path(np.array(free), step=0.02)
+        assert checker.check_motion(qa, qb) == verdicts[-1]
+    opinion = checker.check_path(np.array(free))
     assert opinion.valid == all(verdicts)
     assert [f.edge for f in opinion.findings] == [i for i, ok in enumerate(verdicts) if not ok]
     assert opinion.findings  # else this test would test little
@@ -519,26 +522,31 @@ def test_motions_and_paths_are_judged_by_their_configurations(checker):
 # --- unusable input -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["is_valid", "distance", "contacts"])
-def test_not_a_number_is_an_error(checker, method):
-    with pytest.raises(RobotError, match="not finite"):
-        getattr(checker, method)([np.nan, 0, 0, 0, 0, 0, 0])
+@pytest.mark.parametrize("method", ["is_valid", "clearance", "contacts", "explain"])
+def test_wrong_shapes_are_errors(checker, method):
     with pytest.raises(RobotError, match="shape"):
         getattr(checker, method)([0.0, 0.0])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_not_a_number_is_never_free_and_says_so(checker, bad):
+    q = np.array([bad, 0, 0, 0, 0, 0, 0])
+    assert not checker.is_valid(q)
+    assert not checker.is_valid_batch(q[None])[0]
+    assert not checker.check_motion(q, np.zeros(7))
+    assert not checker.check_motion(np.zeros(7), q)
+    assert [c.kind for c in checker.contacts(q)] == ["not_finite"]
+    assert "give a finite value" in checker.explain(q).text()
+    with pytest.raises(RobotError, match="not finite"):
+        checker.clearance(q)
 
 
 def test_motions_of_nonsense_are_errors(checker):
     q = np.zeros(7)
     with pytest.raises(RobotError, match="not finite"):
-        checker.check_motion(q, q + np.inf)
-    with pytest.raises(RobotError, match="not finite"):
         checker.check_path([q, q * np.nan])
     with pytest.raises(RobotError, match="shape"):
         checker.check_path(q)
-    with pytest.raises(ConfigError, match="step"):
-        checker.check_motion(q, q, step=0.0)
-    with pytest.raises(ConfigError, match="step"):
-        checker.check_motion(q, q, step=float("nan"))
     with pytest.raises(RobotError, match="no link 'foot'"):
         checker.link_distance(q, "foot", "object:1")
 
@@ -546,6 +554,8 @@ def test_motions_of_nonsense_are_errors(checker):
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
+        ({"step": 0.0}, ConfigError, "step"),
+        ({"step": float("nan")}, ConfigError, "step"),
         ({"allowed_contacts": {"foot": {1}}}, RobotError, "foot"),
         ({"allowed_contacts": {"hand": {7}}}, ConfigError, "object 7"),
         ({"link_meshes": {"foot": trimesh.creation.box()}}, RobotError, "foot"),

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles.small_scenes import small_config, small_scene
 
-from vprism_plan.collision import CheckerConfig
+from vprism_plan.collision import CheckerConfig, MeshChecker
 from vprism_plan.errors import ConfigError
 from vprism_plan.evaluation.experiments.sweep import Case, SweepError
 from vprism_plan.evaluation.planning_benchmark import (
@@ -31,7 +31,6 @@ from vprism_plan.evaluation.planning_benchmark import (
 )
 from vprism_plan.evaluation.planning_benchmark.checkers import Bench, known_nodes
 from vprism_plan.evaluation.planning_benchmark.contenders import settings
-from vprism_plan.evaluation.planning_benchmark.fcl_checker import bisected
 from vprism_plan.evaluation.planning_benchmark.grid_world import benchmark_grid, benchmark_robot
 from vprism_plan.evaluation.planning_benchmark.ompl_log import log_text
 from vprism_plan.evaluation.planning_benchmark.summary import (
@@ -152,18 +151,20 @@ def test_fcl_says_what_the_mesh_checker_says(bench):
     down = np.array([0.0, 0.5, 0.0, -2.1, 0.0, 2.6, 0.8])
     Q = np.clip(down + rng.normal(0.0, 0.25, (60, 7)), checker.robot.lower, checker.robot.upper)
     verdicts = [checker.is_valid(q) for q in Q]
-    assert verdicts == [checker.meshes.is_valid(q) for q in Q]
+    config = CheckerConfig(margin=checker.config.margin)
+    meshes = MeshChecker(
+        checker.world, checker.robot, config, links="spheres", step=0.02, seen=False
+    )
+    assert verdicts == [meshes.is_valid(q) for q in Q]
     assert 5 < sum(verdicts) < 55
     for qa, qb in zip(Q[:12:2], Q[1:12:2], strict=True):
-        assert checker.check_motion(qa, qb) <= checker.meshes.check_motion(qa, qb, 0.02)
+        assert checker.check_motion(qa, qb) <= meshes.check_motion(qa, qb)
         report_ = checker.check_motion_report(qa, qb)
         assert report_.valid == checker.check_motion(qa, qb)
         assert report_.text()
     refused = Q[verdicts.index(False)]
     assert not checker.explain(refused).valid
     assert checker.explain(refused).contacts
-    for pieces in (1, 2, 5, 16, 37):
-        assert sorted(bisected(pieces)) == list(range(pieces + 1))
 
 
 # --- runs -----------------------------------------------------------------------------

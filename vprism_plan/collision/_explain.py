@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Turns a refused configuration into named reasons. Not on the fast path."""
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._kernels.checking import FARTHEST
+from vprism_plan.collision._bodies import kind_of
 from vprism_plan.collision.protocols import Answers, BakedWorld, NodeField, RuledWorld
 from vprism_plan.collision.reports import Contact, Kind, StateReport
 from vprism_plan.world.pictured import free_balls
+
+# Signed distance, metres; where, world; unit direction that leads out.
+Touch = tuple[Any, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 _STATUS_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
 _SAMPLES = 96
@@ -32,45 +37,74 @@ def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
 
 def explain(checker: Answers, q: Float[np.ndarray, "dof"]) -> StateReport:
     """Return the report of `CollisionChecker.explain`."""
-    policies = {
-        "occluded": checker.world.config.occluded,
-        "unobserved": checker.world.config.unobserved,
-    }
-    limits = _limit_contacts(checker, q)
+
+    def reasons() -> list[Contact]:
+        near = [*_world_contacts(checker, q), *_self_contacts(checker, q)]
+        return [*near, *limit_contacts(checker.robot, q)]
+
+    return report(
+        checker,
+        q,
+        reasons,
+        lambda: checker.risk_contacts(q),
+        lambda: _allowed_contacts(checker, q),
+        lambda: checker.sphere_clearances(q)[0],
+    )
+
+
+def report(
+    checker: Any,
+    q: Float[np.ndarray, "dof"],
+    reasons: Callable[[], list[Contact]],
+    risks: Callable[[], Iterable[Contact]],
+    permitted: Callable[[], Iterable[Contact]],
+    centers: Callable[[], Float[np.ndarray, "s 3"]],
+) -> StateReport:
+    """Put the report of a checker together.
+
+    Args:
+        checker: whose verdict it is.
+        q: configuration.
+        reasons: what refuses it, asked if it is refused.
+        risks: what `max_risk` refuses, likewise; named last.
+        permitted: contacts that the rules permit.
+        centers: of the robot's spheres, world, metres.
+    """
+    world = checker.world
+    policies = {"occluded": world.config.occluded, "unobserved": world.config.unobserved}
+    margin = checker.config.margin
     if not np.isfinite(q).all():
+        limits = tuple(limit_contacts(checker.robot, q))
         return StateReport(
-            False, tuple(limits), np.nan, np.nan, checker.config.margin, policies=policies,
-            warnings=checker.warnings,
-        )  # fmt: skip
+            False, limits, np.nan, np.nan, margin, policies=policies, warnings=checker.warnings
+        )
     valid = checker.is_valid(q)
     contacts: list[Contact] = []
     if not valid:
-        contacts = [*_world_contacts(checker, q), *_self_contacts(checker, q), *limits]
-        contacts.sort(key=lambda contact: -contact.depth)
-        contacts += checker.risk_contacts(q)
+        contacts = sorted(reasons(), key=lambda contact: -contact.depth)
+        contacts += risks()
     return StateReport(
         valid=valid,
         contacts=tuple(contacts),
         clearance=checker.clearance(q),
         self_clearance=float(checker.self_clearance_batch(q[None])[0]),
-        margin=checker.config.margin,
-        shares=volume_shares(checker, q),
+        margin=margin,
+        shares=volume_shares(world, checker.robot, centers()),
         policies=policies,
-        allowed=tuple(_allowed_contacts(checker, q)),
+        allowed=tuple(permitted()),
         warnings=checker.warnings,
     )
 
 
-def volume_shares(checker: Answers, q: Float[np.ndarray, "dof"]) -> dict[str, float]:
+def volume_shares(world: Any, robot: Any, centers: Float[np.ndarray, "s 3"]) -> dict[str, float]:
     """Return which share of the moving links' sphere volume lies in space nobody has seen."""
-    centers = checker.sphere_clearances(q)[0]
-    moving = ~np.asarray(checker.robot.arrays.link_fixed)[checker.robot.sphere_links]
+    moving = ~np.asarray(robot.arrays.link_fixed)[robot.sphere_links]
     if not moving.any():
         return dict.fromkeys(_STATUS_NAMES.values(), 0.0)
-    centers, radii = centers[moving], checker.robot.sphere_radii[moving]
+    centers, radii = centers[moving], robot.sphere_radii[moving]
     ball = unit_ball_points()
     points = centers[:, None] + radii[:, None, None] * ball
-    status = np.asarray(checker.world.status(points.reshape(-1, 3))).reshape(len(radii), -1)
+    status = np.asarray(world.status(points.reshape(-1, 3))).reshape(len(radii), -1)
     weight = radii**3 / np.sum(radii**3)
     return {
         name: float(weight @ np.mean(status == code, axis=1))
@@ -78,26 +112,29 @@ def volume_shares(checker: Answers, q: Float[np.ndarray, "dof"]) -> dict[str, fl
     }
 
 
-def _limit_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:
-    robot = checker.robot
+def limit_contacts(robot: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+    """Return the joints that are not finite, absurdly far, or outside their limits."""
     found = []
     for j, name in enumerate(robot.joint_names):
-        if not np.isfinite(q[j]):
-            detail = f"joint {name} is {q[j]}; give a finite value"
+        value, low, high = q[j], robot.lower[j], robot.upper[j]
+        if not np.isfinite(value):
+            detail = f"joint {name} is {value}; give a finite value"
             found.append(Contact("not_finite", name, "not_finite", np.inf, detail=detail))
-        elif abs(q[j]) > FARTHEST:
+            continue
+        if abs(value) > FARTHEST:
+            excess = float(abs(value) - FARTHEST)
             detail = (
-                f"joint {name} is {q[j]:g}, farther than {FARTHEST:g} from 0; count fewer turns"
+                f"joint {name} is {value:g}, farther than {FARTHEST:g} from 0; count fewer turns"
             )
-            excess = float(abs(q[j]) - FARTHEST)
-            found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
-        elif not robot.continuous[j] and not robot.lower[j] <= q[j] <= robot.upper[j]:
-            excess = float(max(robot.lower[j] - q[j], q[j] - robot.upper[j]))
+        elif not robot.continuous[j] and not low <= value <= high:
+            excess = float(max(low - value, value - high))
             detail = (
-                f"joint {name} is {q[j]:.4f}, outside its limits "
-                f"[{robot.lower[j]:.4f}, {robot.upper[j]:.4f}]"
+                f"joint {name} is {value:.6g}, outside its limits [{low:.6g}, {high:.6g}] "
+                f"by {excess:.3g}"
             )
-            found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
+        else:
+            continue
+        found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
     return found
 
 
@@ -105,85 +142,67 @@ def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Conta
     """Return the deepest contact of each (link, body), from every sphere's own distances."""
     robot, world, margin = checker.robot, checker.world, checker.config.margin
     centers, plane, which, field = checker.sphere_clearances(q)
-    deepest: dict[tuple[str, str], Contact] = {}
+    found = []
     robots = free_balls(getattr(world.map, "views", ()))
-
-    def keep(contact: Contact) -> None:
-        key = (contact.link, contact.body)
-        if key not in deepest or deepest[key].depth < contact.depth:
-            deepest[key] = contact
-
     for s in range(len(centers)):
         link = int(robot.sphere_links[s])
         if robot.arrays.link_fixed[link]:
             continue
-        radius = float(robot.sphere_radii[s])
+        name, radius = robot.link_names[link], float(robot.sphere_radii[s])
+        padding = float(robot.arrays.link_padding[link])  # a distance to keep, like the margin
+        required = margin + padding
         if not plane[s] > margin:
             row = world.planes[which[s]]
             body = world.plane_names[which[s]]
-            point = centers[s] - radius * row[:3]
-            kind: Kind = "support" if body == "support surface" else "known"
-            keep(_contact(kind, robot.link_names[link], body, margin - plane[s], s, point, row[:3]))
+            touch = plane[s] + padding, centers[s] - radius * row[:3], row[:3]
+            found.append(contact(kind_of(body), name, body, touch, required, s))
         if not field[s] > margin:
             body, normal = nearest_source(world, checker.verdict_field(link), centers[s])
-            kind = _kind_of(body)
-            point = centers[s] - radius * normal
+            kind = kind_of(body)
             sure = None
             if kind not in {"known", "support"}:
                 ball = centers[s] + radius * unit_ball_points()
                 sure = float(np.max(world.map.occupancy(ball)))
-            detail = _policy_detail(checker, kind)
+            touch = field[s] + padding, centers[s] - radius * normal, normal
+            detail = policy_detail(world.config, kind)
             if kind == "occluded":
                 at = np.append(centers[s], radius)
                 detail += _beside_pictured_robot(at, robots, margin, world)
-            keep(
-                _contact(
-                    kind,
-                    robot.link_names[link],
-                    body,
-                    margin - field[s],
-                    s,
-                    point,
-                    normal,
-                    sure,
-                    detail,
-                )
-            )
-    return list(deepest.values())
+            found.append(contact(kind, name, body, touch, required, s, sure, detail))
+    return deepest(found)
 
 
-def _contact(
+def contact(
     kind: Kind,
     link: str,
     body: str,
-    depth: float,
+    touch: Touch,
+    required: float,
     sphere: int,
-    position: np.ndarray,
-    normal: np.ndarray,
     probability: float | None = None,
     detail: str = "",
 ) -> Contact:
+    """Return a contact from how near, where and which way out, and the distance asked for."""
+    gap, position, normal = touch
     x, y, z = (float(v) for v in position)
     nx, ny, nz = (float(v) for v in normal)
-    return Contact(
-        kind, link, body, float(depth), sphere, (x, y, z), (nx, ny, nz), probability, detail
-    )
+    place, out = (x, y, z), (nx, ny, nz)
+    depth, required = float(required - gap), float(required)
+    return Contact(kind, link, body, depth, sphere, place, out, probability, detail, required)
 
 
-def _kind_of(body: str) -> Kind:
-    head = body.split(":", 1)[0]
-    kinds: dict[str, Kind] = {
-        "object": "object",
-        "background": "background",
-        "occluded": "occluded",
-        "unobserved": "unobserved",
-        "support surface": "support",
-    }
-    return kinds.get(head, "known")
+def deepest(contacts: Iterable[Contact]) -> list[Contact]:
+    """Return the deepest contact of each link and body."""
+    found: dict[tuple[str, str], Contact] = {}
+    for item in contacts:
+        key = (item.link, item.body)
+        if key not in found or found[key].depth < item.depth:
+            found[key] = item
+    return list(found.values())
 
 
-def _policy_detail(checker: Answers, kind: Kind) -> str:
-    config = checker.world.config
+def policy_detail(config: Any, kind: Kind) -> str:
+    """Return why what no object of the map accounts for is an obstacle."""
     if kind == "occluded":
         return f"no camera saw this space; policy occluded={config.occluded!r}"
     if kind == "unobserved" and config.unobserved == "free":
@@ -217,23 +236,21 @@ def _allowed_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Con
     ):
         return []
     centers = checker.sphere_clearances(q)[0]
-    deepest: dict[tuple[int, int], Contact] = {}
+    found = []
     for s, center in enumerate(centers):
         link, radius = int(robot.sphere_links[s]), float(robot.sphere_radii[s])
         if robot.arrays.link_fixed[link]:
             continue
         for object_id in sorted(checker.allowed_objects(link)):
             field = world.object_field(object_id)
-            depth = radius - float(field.lower_bound(center[None])[0])
-            kept = deepest.get((link, object_id))
-            if depth < 0.0 or (kept is not None and kept.depth >= depth):
-                continue
-            _, normal = nearest_source(world, field, center)
-            deepest[link, object_id] = _contact(
-                "object", robot.link_names[link], f"object:{object_id}", depth, s,
-                center - radius * normal, normal, None, "allowed",
-            )  # fmt: skip
-    return list(deepest.values())
+            gap = float(field.lower_bound(center[None])[0]) - radius
+            if gap <= 0.0:
+                _, normal = nearest_source(world, field, center)
+                touch = gap, center - radius * normal, normal
+                body = f"object:{object_id}"
+                name = robot.link_names[link]
+                found.append(contact("object", name, body, touch, 0.0, s, None, "allowed"))
+    return deepest(found)
 
 
 def nearest_source(
@@ -288,6 +305,6 @@ def _self_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contac
         length = float(np.linalg.norm(apart))
         normal = apart / length if length > 0 else np.array([0.0, 0.0, 1.0])
         point = centers[s] - robot.sphere_radii[s] * normal
-        names = robot.link_names
-        found.append(_contact("self", names[a], names[b], margin - gaps[p], s, point, normal))
+        names, touch = robot.link_names, (float(gaps[p]), point, normal)
+        found.append(contact("self", names[a], names[b], touch, margin, s))
     return found

@@ -8,7 +8,7 @@ its figures for a sphere that overlaps a mesh (depth and distance are garbage th
 distance from the sphere's centre is exact instead), and its signed distance.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -60,29 +60,13 @@ class Shape:
         kind: "sphere", "box", "cylinder" or "mesh".
         size: as for `PrimitiveGeometry`; unused for a mesh.
         mesh: `trimesh.Trimesh`, for a mesh.
-        padding: metres by which the shape is grown all around. A sphere takes it up in its
-            radius. FCL has no boxes and cylinders with round edges: they stay as they
-            are, and what comes nearer than the padding touches.
     """
 
-    def __init__(
-        self,
-        kind: str,
-        size: tuple[float, ...] = (),
-        mesh: Any = None,
-        padding: float = 0.0,
-    ) -> None:
+    def __init__(self, kind: str, size: tuple[float, ...] = (), mesh: Any = None) -> None:
         self.kind = kind
-        self.size = (size[0] + padding,) if kind == "sphere" else size
-        self.padding = 0.0 if kind == "sphere" else padding
+        self.size = size
         self.normals: np.ndarray | None = None
         self.body = fcl().CollisionObject(self._geometry(mesh))
-        # With sharp edges, so it holds the padded shape: for the place of a contact only.
-        self.hull: Any = None
-        if self.padding > 0.0:
-            factors = (2.0, 2.0, 2.0) if kind == "box" else (1.0, 2.0)
-            grown = (v + f * padding for v, f in zip(size, factors, strict=True))
-            self.hull = Shape(kind, tuple(grown))
         self._rotation = np.eye(3)
         self._center = np.zeros(3)
 
@@ -113,13 +97,15 @@ class Shape:
         self._rotation = R
         self._center = t
         self.body.setTransform(fcl().Transform(R, t))
-        if self.hull is not None:
-            self.hull.place(R, t)
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
         """Where the shape's own origin is, world frame."""
         return self._center
+
+    def to_world(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Move a point of the shape's own frame along with it."""
+        return self._rotation @ point + self._center
 
     def normal_of(self, face: int) -> Float[np.ndarray, "3"]:
         """Outward normal of a triangle, world frame."""
@@ -140,25 +126,13 @@ def face_normals(
 
 def touches(a: Shape, b: Shape) -> bool:
     """Whether two shapes intersect; of a mesh, only its surface counts."""
-    if a.padding + b.padding > 0.0:
-        return gap(a, b) <= 0.0
-    return _cross(a, b)
-
-
-def _cross(a: Shape, b: Shape) -> bool:
-    """Whether two shapes without their padding intersect."""
     module = fcl()
     return bool(module.collide(a.body, b.body, module.CollisionRequest(), module.CollisionResult()))
 
 
 def gap(a: Shape, b: Shape) -> float:
     """Distance between two shapes, metres; 0.0 where they touch."""
-    return max(0.0, _core_gap(a, b) - a.padding - b.padding)
-
-
-def _core_gap(a: Shape, b: Shape) -> float:
-    """Distance between two shapes without their padding, metres; 0.0 where they touch."""
-    if _cross(a, b):  # FCL's distance is anything between -1 and garbage then
+    if touches(a, b):  # FCL's distance is anything between -1 and garbage then
         return 0.0
     module = fcl()
     request, result = module.DistanceRequest(), module.DistanceResult()
@@ -177,10 +151,7 @@ def signed_gap(a: Shape, b: Shape) -> float:
 def point_distance(
     shape: Shape, point: Float[np.ndarray, "3"]
 ) -> tuple[float, Float[np.ndarray, "3"]]:
-    """Distance from a point to a mesh's surface, metres, and the nearest point on it (world).
-
-    The nearest point is right for a mesh that was not moved: FCL gives it in the mesh's frame.
-    """
+    """Distance from a point to a mesh's surface, metres, and the nearest point on it (world)."""
     module = fcl()
     ball = module.CollisionObject(module.Sphere(_POINT_RADIUS), module.Transform(point))
     # The mesh goes first: FCL swaps the two otherwise, and the points with them.
@@ -189,7 +160,30 @@ def point_distance(
     result = module.DistanceResult()
     request = module.DistanceRequest(enable_nearest_points=True)
     distance = module.distance(shape.body, ball, request, result)
-    return float(distance) + _POINT_RADIUS, np.array(result.nearest_points[0])
+    # For a sphere FCL gives the mesh's point in the mesh's own frame.
+    return float(distance) + _POINT_RADIUS, shape.to_world(np.array(result.nearest_points[0]))
+
+
+def point_within(shape: Shape, point: Float[np.ndarray, "3"], reach: float) -> bool:
+    """Whether a point is within `reach` (metres) of a mesh's surface."""
+    module = fcl()
+    ball = module.CollisionObject(module.Sphere(max(reach, _POINT_RADIUS)), module.Transform(point))
+    request, result = module.CollisionRequest(), module.CollisionResult()
+    return bool(module.collide(shape.body, ball, request, result))
+
+
+def nearest_points(a: Shape, b: Shape) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """The points (world) at which two shapes that do not touch are nearest to each other."""
+    if b.hollow and not a.hollow:
+        on_b, on_a = nearest_points(b, a)
+        return on_a, on_b
+    if a.hollow and b.kind == "sphere":
+        way, on_a = point_distance(a, b.center)
+        return on_a, b.center + (b.size[0] / max(way, _POINT_RADIUS)) * (on_a - b.center)
+    module, result = fcl(), fcl().DistanceResult()
+    module.distance(a.body, b.body, module.DistanceRequest(enable_nearest_points=True), result)
+    first, second = (np.array(point, dtype=np.float64) for point in result.nearest_points)
+    return first, second
 
 
 def deepest_touch(a: Shape, b: Shape) -> Touch | None:
@@ -198,17 +192,8 @@ def deepest_touch(a: Shape, b: Shape) -> Touch | None:
     Between solids the depth is the way out; for a sphere and a mesh, how far the surface
     reaches into the sphere. For other shapes and a mesh it is FCL's figure for the deepest
     triangle, which is local: it says how far the solid reaches through one triangle, not
-    how far it has to move. A mesh's normal is the triangle's own. Padding adds to depths.
+    how far it has to move. A mesh's normal is the triangle's own.
     """
-    padding = a.padding + b.padding
-    if padding > 0.0:
-        between = _core_gap(a, b)
-        if between > padding:
-            return None
-        touch = deepest_touch(a.hull or a, b.hull or b)
-        if between > 0.0 and touch is not None:
-            touch = replace(touch, depth=padding - between)
-        return touch
     module = fcl()
     request = module.CollisionRequest(num_max_contacts=_MAX_CONTACTS, enable_contact=True)
     result = module.CollisionResult()

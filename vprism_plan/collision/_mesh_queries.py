@@ -2,18 +2,21 @@
 """What touches what at one configuration: a robot's solids, a world's surfaces, FCL between."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan.collision import _fcl
+from vprism_plan.collision._bodies import kind_of
+from vprism_plan.collision._explain import Touch, contact, deepest, policy_detail
 from vprism_plan.collision._mesh_world import MeshWorld
+from vprism_plan.collision._seen_space import HiddenSpace, SeenPoints
 from vprism_plan.collision._solids import PlacedSolids
+from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.protocols import BakedWorld
-from vprism_plan.collision.reports import Contact, Kind
-from vprism_plan.errors import ConfigError
-from vprism_plan.robots import Robot
+from vprism_plan.collision.reports import Contact
+from vprism_plan.world.visibility import OCCLUDED
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -28,7 +31,9 @@ class Queries:
         world: what to avoid.
         placed: the robot's solids.
         surfaces: the world's bodies.
-        allowed: link -> class -> whether they may touch; see `contact_rules`.
+        allowed: link -> class -> whether they may touch; class 0 never.
+        config: margins.
+        seen: whether observed points and hidden space count, too.
     """
 
     def __init__(
@@ -37,6 +42,8 @@ class Queries:
         placed: PlacedSolids,
         surfaces: MeshWorld,
         allowed: Bool[np.ndarray, "links classes"],
+        config: CheckerConfig,
+        seen: bool,
     ) -> None:
         self.world = world
         self.placed = placed
@@ -45,32 +52,40 @@ class Queries:
         self._allowed = allowed
         self._planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
         self._pairs = placed.pairs()
-        padding = np.array([solid.padding for solid in placed.solids])
-        self._apart = (placed.radii - padding)[self._pairs].sum(axis=1)
+        self._margin, self._self_margin = config.margin, config.self_margin
+        # Padding is a distance to keep from the world: the solids stay as they are.
+        self._padding = placed.robot.arrays.link_padding[placed.links]
+        self._need = config.margin + self._padding
+        self._apart = placed.radii[self._pairs].sum(axis=1) + config.self_margin
         # Pairs of solid and body that are never looked at: allowed, or of a fixed link.
         self._ignored = allowed[placed.links][:, surfaces.classes] | ~placed.moving[:, None]
+        self._points = SeenPoints(world) if seen else None
+        self._hidden = HiddenSpace(world, placed, self._padding) if seen else None
 
     def collides(self) -> bool:
-        """Whether a moving solid touches the world, or two links each other."""
+        """Whether a moving solid comes too near to the world, or two links to each other."""
         for plane in self._planes:
-            if (self.placed.plane_gaps(plane)[self.placed.moving] <= 0.0).any():
+            if (self.placed.plane_gaps(plane) <= self._need)[self.placed.moving].any():
                 return True
         near = self._near()
         return (
             any(self._touches(int(i), int(b)) for i, b in np.argwhere(near))
             or bool(self._swallowed(near).any())
             or any(self._collide(int(i), int(j)) for i, j in self._near_pairs())
+            or self._touches_points()
+            or any(True for _ in self._unseen(self._margin))
         )
 
-    def distance(self) -> float:
-        """Return `MeshChecker.distance`, metres."""
-        placed = self.placed
-        best = math.inf
+    def clearance(self) -> float:
+        """Return `MeshChecker.clearance`, metres."""
+        placed, best = self.placed, math.inf
         for plane in self._planes:
-            best = min(best, float(np.min(placed.plane_gaps(plane)[placed.moving], initial=best)))
-        if self._swallowed(self._near()).any():
+            gaps = placed.plane_gaps(plane) - self._padding
+            best = min(best, float(np.min(gaps[placed.moving], initial=best)))
+        if self._swallowed(self._near()).any() or any(True for _ in self._unseen(0.0)):
             best = min(best, 0.0)
-        bounds = self.surfaces.box_distances(placed.centers) - placed.radii[:, None]
+        bounds = self.surfaces.box_distances(placed.centers)
+        bounds -= (placed.radii + self._padding)[:, None]
         bounds[self._ignored] = np.inf
         owner = self._owners()
         for flat in np.argsort(bounds, axis=None):
@@ -78,17 +93,37 @@ class Queries:
             # Where the bounds overlap they say nothing of how deep the solid is.
             if bounds[i, b] > max(best, 0.0) or not np.isfinite(bounds[i, b]):
                 break
-            best = min(best, self._gap(i, b, int(owner[i])))
-        return best
+            best = min(best, self._gap(i, b, int(owner[i])) - self._padding[i])
+        if self._points is not None:
+            for i in np.flatnonzero(placed.moving).tolist():
+                padding, allowed = float(self._padding[i]), self._allowed[placed.links[i]]
+                nearest = self._points.distance(placed, i, best + padding, allowed)
+                best = min(best, nearest - padding)
+        return float(best)
+
+    def self_clearance(self) -> float:
+        """Return the smallest gap between two links that the robot tests, metres."""
+        return min((self._link_gap(int(i), int(j)) for i, j in self._pairs), default=math.inf)
 
     def contacts(self) -> list[Contact]:
         """Return the deepest contact of each link and body."""
-        deepest: dict[tuple[str, str], Contact] = {}
-        for contact in (*self._plane_contacts(), *self._body_contacts(), *self._self_contacts()):
-            key = (contact.link, contact.body)
-            if key not in deepest or deepest[key].depth < contact.depth:
-                deepest[key] = contact
-        return list(deepest.values())
+        near = self._near()
+        found = (
+            *self._plane_contacts(),
+            *self._body_contacts(near, self._need),
+            *self._swallowed_contacts(near),
+            *self._point_contacts(),
+            *self._hidden_contacts(),
+            *self._self_contacts(),
+        )
+        return deepest(found)
+
+    def permitted(self) -> list[Contact]:
+        """Return the deepest contact of each link with each object that it may touch."""
+        distances = self.surfaces.box_distances(self.placed.centers)
+        near = (distances <= self.placed.radii[:, None]) & self._ignored
+        near &= self.placed.moving[:, None]
+        return deepest(self._body_contacts(near, np.zeros(len(self.solids)), "allowed"))
 
     def link_distance(self, link: str, body: str) -> float:
         """Return `MeshChecker.link_distance`, metres."""
@@ -96,7 +131,8 @@ class Queries:
         rows = np.flatnonzero(placed.links == names.index(link))
         if body in self.world.plane_names:
             plane = self._planes[self.world.plane_names.index(body)]
-            return float(np.min(placed.plane_gaps(plane)[rows], initial=math.inf))
+            gaps = placed.plane_gaps(plane) - self._padding
+            return float(np.min(gaps[rows], initial=math.inf))
         if body in names:
             others = np.flatnonzero(placed.links == names.index(body))
             return min(
@@ -105,7 +141,7 @@ class Queries:
         owner = self._owners()
         return min(
             (
-                self._gap(int(i), b, int(owner[i]))
+                self._gap(int(i), b, int(owner[i])) - float(self._padding[i])
                 for b, found in enumerate(self.surfaces.bodies)
                 if found.name == body
                 for i in rows
@@ -126,7 +162,7 @@ class Queries:
     def _near(self) -> Bool[np.ndarray, "n b"]:
         """Pairs of solid and body whose bounds meet."""
         distances = self.surfaces.box_distances(self.placed.centers)
-        return (distances <= self.placed.radii[:, None]) & ~self._ignored
+        return (distances <= (self.placed.radii + self._need)[:, None]) & ~self._ignored
 
     def _near_pairs(self) -> np.ndarray:
         """Pairs of solids of different links whose balls meet, (p, 2)."""
@@ -152,9 +188,10 @@ class Queries:
         return inside
 
     def _touches(self, i: int, b: int) -> bool:
-        """Whether solid i cuts body b's surface, lies in a known mesh, or holds the body."""
+        """Whether solid i comes too near to body b's surface, lies in a known mesh, or holds
+        the body."""
         body = self.surfaces.bodies[b]
-        if _fcl.touches(body.shape, self.placed.shape(i)):
+        if _within(body.shape, self.placed.shape(i), float(self._need[i])):
             return True
         return body.contains(self.placed.witnesses[i]) or self._holds(i, body.witnesses)
 
@@ -167,19 +204,35 @@ class Queries:
         return any(solid.holds(point) for point in self.placed.to_link(i, near))
 
     def _collide(self, i: int, j: int) -> bool:
-        """Whether two solids of the robot touch."""
-        if _fcl.touches(self.placed.own_shape(i), self.placed.own_shape(j)):
+        """Whether two solids of the robot come too near to each other."""
+        if _within(self.placed.shape(i), self.placed.shape(j), self._self_margin):
             return True
         witnesses = self.placed.witnesses
         return self._holds(i, witnesses[j : j + 1]) or self._holds(j, witnesses[i : i + 1])
 
+    def _touches_points(self) -> bool:
+        """Whether a moving solid comes too near to an observed point."""
+        points, placed = self._points, self.placed
+        return points is not None and any(
+            True
+            for i in points.near(placed, self._need)
+            for _ in points.inside(placed, i, float(self._need[i]), self._allowed[placed.links[i]])
+        )
+
+    def _unseen(self, margin: float) -> Iterator[tuple[int, str, Float[np.ndarray, "3"]]]:
+        """Solid, body and place of the samples of the robot's surface that are hidden."""
+        if self._hidden is None:
+            return
+        for i, point, code in zip(*self._hidden.find(margin), strict=True):
+            yield int(i), "occluded" if code == OCCLUDED else "unobserved", point
+
     def _link_gap(self, i: int, j: int) -> float:
         """Distance between two solids of the robot; 0 where a mesh is touched."""
-        a, b = self.placed.own_shape(i), self.placed.own_shape(j)
+        a, b = self.placed.shape(i), self.placed.shape(j)
         return _fcl.gap(a, b) if a.hollow or b.hollow else _fcl.signed_gap(a, b)
 
     def _gap(self, i: int, b: int, owner: int) -> float:
-        """Distance of solid i to body b as `distance` states it; `owner` as of `_owners`."""
+        """Distance of solid i to body b, padding aside; `owner` as of `_owners`."""
         body, shape = self.surfaces.bodies[b], self.placed.shape(i)
         if not (body.shape.hollow or shape.hollow):
             return _fcl.signed_gap(body.shape, shape)
@@ -198,107 +251,110 @@ class Queries:
 
     # --- reasons -------------------------------------------------------------------
 
-    def _plane_contacts(self) -> list[Contact]:
-        found = []
+    def _plane_contacts(self) -> Iterator[Contact]:
         for plane, name in zip(self._planes, self.world.plane_names, strict=True):
             gaps = self.placed.plane_gaps(plane)
-            for i in np.flatnonzero(self.placed.moving & (gaps <= 0.0)):
-                point = self.placed.lowest_point(int(i), plane[:3])
-                kind: Kind = "support" if name == "support surface" else "known"
-                found.append(self._contact(int(i), kind, name, -gaps[i], point, plane[:3]))
-        return found
+            for i in np.flatnonzero(self.placed.moving & (gaps <= self._need)).tolist():
+                point = self.placed.lowest_point(i, plane[:3])
+                yield self._contact(i, name, (float(gaps[i]), point, plane[:3]), self._need[i])
 
-    def _body_contacts(self) -> list[Contact]:
-        near = self._near()
-        swallowed = self._swallowed(near)
+    def _body_contacts(
+        self, near: Bool[np.ndarray, "n b"], need: Float[np.ndarray, "n"], detail: str = ""
+    ) -> Iterator[Contact]:
         owner = self._owners()
-        found = []
-        reported = np.zeros(len(self.solids), dtype=bool)
         for row, column in np.argwhere(near):
             i, b = int(row), int(column)
             inside = self._is_inside(i, b, int(owner[i]))
-            if not (inside or self._touches(i, b)):
-                continue
-            reported[i] |= inside
-            body = self.surfaces.bodies[b]
-            kind: Kind = "object" if body.class_index else "known"
-            depth, point, normal = self._touch(i, b, inside)
-            found.append(self._contact(i, kind, body.name, depth, point, normal))
-        # Inside an object's level set, but outside the box of its mesh.
-        for row in np.flatnonzero(swallowed & ~reported):
-            i = int(row)
-            name = f"object:{self.world.map.object_ids[int(owner[i]) - 1]}"
-            found.append(self._contact(i, "object", name, 0.0, self.placed.witnesses[i], _UP))
-        return found
+            if inside or self._touches(i, b):
+                touch = self._touch(i, b, inside)
+                yield self._contact(i, self.surfaces.bodies[b].name, touch, need[i], detail)
 
-    def _touch(
-        self, i: int, b: int, inside: bool
-    ) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Depth, position and direction out of the contact of solid i with body b."""
+    def _swallowed_contacts(self, near: Bool[np.ndarray, "n b"]) -> Iterator[Contact]:
+        """What lies inside an object's level set, but outside the box of its mesh."""
+        owner = self._owners()
+        for i in np.flatnonzero(self._swallowed(near)).tolist():
+            name = f"object:{self.world.map.object_ids[int(owner[i]) - 1]}"
+            boxed = [b for b, body in enumerate(self.surfaces.bodies) if body.name == name]
+            if not near[i, boxed].any():
+                yield self._contact(i, name, (0.0, self.placed.witnesses[i], _UP), self._need[i])
+
+    def _touch(self, i: int, b: int, inside: bool) -> Touch:
+        """How near solid i and body b are, or how deep in each other."""
         body, shape = self.surfaces.bodies[b], self.placed.shape(i)
         if shape.kind != "sphere" or not body.shape.hollow:
             touch = _fcl.deepest_touch(body.shape, shape)
             if touch is not None:
-                return touch.depth, touch.position, touch.normal
+                return -touch.depth, touch.position, touch.normal
         start = self.placed.witnesses[i]
-        if not body.shape.hollow:  # a primitive inside a link's mesh
+        if body.shape.hollow and (shape.kind == "sphere" or inside):
+            way, point = _fcl.point_distance(body.shape, start)
+            out = point - start if inside else start - point
+            normal = out / way if way > 1e-9 else _UP
+            if shape.kind == "sphere":
+                return (-way if inside else way) - shape.size[0], point, normal
+            return -_fcl.gap(body.shape, shape), start, normal
+        if self._holds(i, body.witnesses):  # a body inside a link's mesh
             return 0.0, body.witnesses[0], _UP
-        way, point = _fcl.point_distance(body.shape, start)
-        out = point - start if inside else start - point
-        normal = out / way if way > 1e-9 else _UP
-        if shape.kind == "sphere":
-            return max(0.0, shape.size[0] + (way if inside else -way)), point, normal
-        return _fcl.gap(body.shape, shape), start, normal
+        return _apart(body.shape, shape)
 
-    def _self_contacts(self) -> list[Contact]:
-        found = []
-        for i, j in self._near_pairs():
-            if not self._collide(int(i), int(j)):
+    def _point_contacts(self) -> Iterator[Contact]:
+        points = self._points
+        if points is None:
+            return
+        for i in points.near(self.placed, self._need):
+            need = float(self._need[i])
+            found = points.deepest(self.placed, i, need, self._allowed[self.placed.links[i]])
+            for body, (gap, row) in found.items():
+                place = points.points[row]
+                out = self.placed.centers[i] - place
+                length = float(np.linalg.norm(out))
+                normal = out / length if length > 1e-9 else _UP
+                name, detail = points.bodies[body]
+                yield self._contact(i, name, (gap, place, normal), need, detail)
+
+    def _hidden_contacts(self) -> Iterator[Contact]:
+        """Samples in hidden space, or as near to it as the margin: how near is not known."""
+        for margin in (0.0, self._margin) if self._margin > 0.0 else (0.0,):
+            for i, body, place in self._unseen(margin):
+                detail = policy_detail(self.world.config, kind_of(body))
+                yield self._contact(i, body, (margin, place, _UP), self._need[i], detail)
+
+    def _self_contacts(self) -> Iterator[Contact]:
+        for row in self._near_pairs():
+            i, j = int(row[0]), int(row[1])
+            if not self._collide(i, j):
                 continue
             # From the second link to the first: out of the contact for the one that is named.
-            touch = _fcl.deepest_touch(self.placed.own_shape(int(j)), self.placed.own_shape(int(i)))
-            depth, point = 0.0, self.placed.witnesses[i]
-            normal = _UP
+            a, b = self.placed.shape(j), self.placed.shape(i)
+            touch = _fcl.deepest_touch(a, b)
+            found: Touch = (0.0, self.placed.witnesses[i], _UP)
             if touch is not None:
-                depth, point, normal = touch.depth, touch.position, touch.normal
+                found = (-touch.depth, touch.position, touch.normal)
+            elif _fcl.gap(a, b) <= self._self_margin:
+                found = _apart(a, b)
             other = self.placed.robot.link_names[self.solids[j].link]
-            found.append(self._contact(int(i), "self", other, depth, point, normal))
-        return found
+            yield self._contact(i, other, found, self._self_margin)
 
     def _contact(
-        self,
-        i: int,
-        kind: Kind,
-        body: str,
-        depth: float,
-        position: Float[np.ndarray, "3"],
-        normal: Float[np.ndarray, "3"],
+        self, i: int, body: str, touch: Touch, required: float, detail: str = ""
     ) -> Contact:
-        solid = self.solids[i]
-        probability = None
-        if kind == "object":
-            probability = float(np.asarray(self.world.map.occupancy(position[None]))[0])
-        x, y, z = (float(v) for v in position)
-        nx, ny, nz = (float(v) for v in normal)
-        link = self.placed.robot.link_names[solid.link]
-        return Contact(
-            kind, link, body, float(depth), solid.sphere, (x, y, z), (nx, ny, nz), probability
-        )
+        solid, names = self.solids[i], self.placed.robot.link_names
+        kind = "self" if body in names else kind_of(body)
+        sure = None
+        if kind not in {"self", "known", "support"}:
+            sure = float(np.asarray(self.world.map.occupancy(touch[1][None]))[0])
+        name, sphere = names[solid.link], solid.sphere
+        return contact(kind, name, body, touch, float(required), sphere, sure, detail)
 
 
-def contact_rules(
-    robot: Robot, object_ids: Sequence[int], allowed: Mapping[str, Collection[int]]
-) -> Bool[np.ndarray, "links classes"]:
-    """Return which link may touch which class; column 0 (known geometry) is never allowed."""
-    rules = np.zeros((len(robot.link_names), 1 + len(object_ids)), dtype=bool)
-    for name, ids in allowed.items():
-        unknown = sorted(set(ids) - set(object_ids))
-        if unknown:
-            raise ConfigError(
-                f"allowed_contacts of {name!r} names object {unknown[0]}; the map has "
-                f"{list(object_ids)}"
-            )
-        for link in robot.links_of(name):
-            for object_id in ids:
-                rules[robot.link_names.index(link), 1 + list(object_ids).index(object_id)] = True
-    return rules
+def _within(a: _fcl.Shape, b: _fcl.Shape, distance: float) -> bool:
+    """Whether two shapes touch, or are at most so many metres apart."""
+    return _fcl.gap(a, b) <= distance if distance > 0.0 else _fcl.touches(a, b)
+
+
+def _apart(a: _fcl.Shape, b: _fcl.Shape) -> Touch:
+    """Two shapes that do not touch: the place is on the first, and the way out leads to the
+    second."""
+    on_a, on_b = _fcl.nearest_points(a, b)
+    gap = _fcl.gap(a, b)
+    return gap, on_a, (on_b - on_a) / gap if gap > 1e-9 else _UP

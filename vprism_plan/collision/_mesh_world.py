@@ -13,6 +13,10 @@ from vprism_plan.world.known import Box, Cylinder, KnownMesh, Sphere
 from vprism_plan.world.levelset import lattice_refinement
 from vprism_plan.world.rasterize import winding_number
 from vprism_plan.world.refined_meshes import extract_refined_meshes
+from vprism_plan.world.support import RIM, SeenSupport, seen_support
+from vprism_plan.world.world import SUPPORT
+
+_DEEP = 5.0  # metres: what is under a surface that ends reaches down farther than any robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +58,8 @@ class MeshWorld:
             the world's own field.
 
     Attributes:
-        bodies: objects in the map's order, then known geometry.
+        bodies: objects in the map's order, then known geometry, then a support surface that
+            ends somewhere.
         resolution: edge of the marching cubes, metres.
         meshes: object id -> `trimesh.Trimesh`, world frame.
     """
@@ -74,6 +79,9 @@ class MeshWorld:
         ]
         known = (known_body(item) for item in config.known)
         self.bodies += [body for body in known if body is not None]
+        if config.support == "seen" and self.map.plane is not None:
+            support = seen_support(self.map.views, self.map.plane)
+            self.bodies.append(mesh_body(SUPPORT, _prism(support)))
         self.classes = np.array([body.class_index for body in self.bodies], dtype=np.int64)
         self.lower = np.array([body.lower for body in self.bodies]).reshape(-1, 3)
         self.upper = np.array([body.upper for body in self.bodies]).reshape(-1, 3)
@@ -123,6 +131,19 @@ def mesh_body(name: str, mesh: Any, class_index: int = 0) -> Body:
         vertices[faces[first, 0]],
         closed,
     )
+
+
+def _prism(support: SeenSupport) -> Any:
+    """The space under a support surface that ends, as a closed mesh."""
+    import trimesh
+
+    region, normal = support.region, support.plane.normal
+    edges = region.halfplanes - np.array([0.0, 0.0, RIM])
+    edges = edges[np.argsort(np.arctan2(edges[:, 1], edges[:, 0]))]
+    pairs = np.stack([edges, np.roll(edges, -1, axis=0)], axis=1)
+    corners = np.linalg.solve(pairs[:, :, :2], -pairs[:, :, 2:])[:, :, 0]
+    rim = corners @ region.axes + support.plane.offset * normal
+    return trimesh.convex.convex_hull(np.concatenate([rim, rim - _DEEP * normal]))
 
 
 def known_body(item: Any) -> Body | None:

@@ -2,17 +2,17 @@
 """The robot as FCL shapes: primitives, meshes, or spheres where a link has neither."""
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision._fcl import Shape
+from vprism_plan.collision._fcl import Shape, point_distance, point_within
 from vprism_plan.collision._packing import reach_table
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.robots import Robot
+from vprism_plan.robots import PrimitiveGeometry, Robot
 from vprism_plan.world.rasterize import winding_number
 
 LinkShapes = Literal["geometry", "spheres"]
@@ -21,7 +21,7 @@ _MOST_PIECES = 20
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One shape of a link.
+    """One shape of a link, as large as the URDF has it.
 
     Attributes:
         link: index into `robot.link_names`.
@@ -32,10 +32,11 @@ class Solid:
         radius: of that ball, metres.
         witness: (3,) a point of the shape, link frame: the shape is connected, so where
             no surface cuts it this point tells which side all of it is on.
+        primitive: the shape as a formula; None for meshes.
         vertices: (v, 3) of a mesh, link frame; None for primitives.
         mesh: closed `trimesh.Trimesh` whose inside counts, link frame; else None.
-        padding: metres of `shape` and `radius` that other links do not count.
-        own: the shape without padding, which other links are asked about; None: `shape`.
+        hull: (f, 4) half-spaces n . x + d <= 0 around a mesh, link frame.
+        triangles: (f, 3, 3) of its surface, link frame.
     """
 
     link: int
@@ -45,17 +46,23 @@ class Solid:
     center: Float[np.ndarray, "3"]
     radius: float
     witness: Float[np.ndarray, "3"]
+    triangles: Float[np.ndarray, "f 3 3"]
+    primitive: PrimitiveGeometry | None = None
     vertices: np.ndarray | None = None
     mesh: Any = None
-    padding: float = 0.0
-    own: Shape | None = None
+    hull: np.ndarray | None = None
 
     def holds(self, point: Float[np.ndarray, "3"]) -> bool:
         """Whether a point (link frame) is inside a closed mesh."""
-        if self.mesh is None:
-            return False
-        triangles = np.asarray(self.mesh.vertices, dtype=np.float64)[self.mesh.faces]
-        return abs(winding_number(point, triangles)) > 0.5
+        return self.mesh is not None and abs(winding_number(point, self.triangles)) > 0.5
+
+    def bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Lower bound of the signed distance of points (link frame), metres; exact for
+        primitives."""
+        if self.primitive is not None:
+            return self.primitive.signed_distance(points)
+        assert self.hull is not None
+        return np.asarray((points @ self.hull[:, :3].T + self.hull[:, 3]).max(axis=1))
 
 
 def robot_solids(
@@ -96,20 +103,21 @@ def robot_solids(
         elif links == "geometry" and name in robot.geometry and name not in unread:
             solids += _primitives(robot, index)
         else:
+            padding = float(robot.arrays.link_padding[index])
             for sphere in np.flatnonzero(robot.sphere_links == index):
                 pose = np.eye(4)
                 pose[:3, 3] = in_link[sphere]
-                padding = float(robot.arrays.link_padding[index])
                 radius = (float(robot.sphere_radii[sphere]) - padding,)
-                solids.append(_primitive(index, int(sphere), "sphere", radius, pose, padding))
+                ball = PrimitiveGeometry("sphere", radius, pose)
+                solids.append(_primitive(index, ball, int(sphere)))
     return solids
 
 
 def _own_meshes(robot: Robot, name: str) -> list[Any] | None:
     """The URDF's meshes of a link; None if it has none that can stand for it.
 
-    Files that are missing, links that were padded or scaled, and meshes in so many pieces that
-    each triangle would be a solid of its own are left to the spheres, which hold them.
+    Files that are missing, and meshes in so many pieces that each triangle would be a solid of
+    its own, are left to the spheres.
     """
     files = robot.meshes.get(name, ())
     if not files or any(file.path is None for file in files):
@@ -121,10 +129,8 @@ def _own_meshes(robot: Robot, name: str) -> list[Any] | None:
 
 
 def _primitives(robot: Robot, link: int) -> list[Solid]:
-    return [
-        _primitive(link, -1, s.kind, s.size, s.T_link, s.padding)
-        for s in robot.geometry.get(robot.link_names[link], ())
-    ]
+    solids = robot.geometry.get(robot.link_names[link], ())
+    return [_primitive(link, replace(solid, padding=0.0)) for solid in solids]
 
 
 def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
@@ -140,28 +146,19 @@ def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
     ).reshape(-1, 3)
 
 
-def _primitive(
-    link: int,
-    sphere: int,
-    kind: str,
-    size: Sequence[float],
-    T_link: Float[np.ndarray, "4 4"],
-    padding: float = 0.0,
-) -> Solid:
-    size = tuple(float(v) for v in size)
-    radius = (
-        padding
-        + {
-            "sphere": lambda: size[0],
-            "box": lambda: 0.5 * float(np.linalg.norm(size)),
-            "cylinder": lambda: float(np.hypot(size[0], 0.5 * size[1])),
-        }[kind]()
-    )
-    shape = Shape(kind, size, padding=float(padding))
-    center = np.array(T_link[:3, 3])
-    own = Shape(kind, size) if padding > 0.0 else None
+def _primitive(link: int, solid: PrimitiveGeometry, sphere: int = -1) -> Solid:
+    shape = Shape(solid.kind, tuple(float(v) for v in solid.size))
+    center = np.array(solid.T_link[:3, 3])
     return Solid(
-        link, sphere, shape, np.array(T_link), center, radius, center, padding=padding, own=own
+        link,
+        sphere,
+        shape,
+        np.array(solid.T_link),
+        center,
+        solid.bounding_radius(),
+        center,
+        solid.triangles(),
+        primitive=solid,
     )
 
 
@@ -179,10 +176,33 @@ def _mesh_solids(link: int, name: str, mesh: Any) -> list[Solid]:
         points = np.asarray(piece.vertices, dtype=np.float64)
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius = float(np.linalg.norm(points - center, axis=1).max())
-        closed = piece if piece.is_watertight else None
-        shape = Shape("mesh", mesh=piece)
-        solids.append(Solid(link, -1, shape, np.eye(4), center, radius, points[0], points, closed))
+        solids.append(
+            Solid(
+                link,
+                -1,
+                Shape("mesh", mesh=piece),
+                np.eye(4),
+                center,
+                radius,
+                points[0],
+                points[np.asarray(piece.faces)],
+                vertices=points,
+                mesh=piece if piece.is_watertight else None,
+                hull=_hull(points),
+            )
+        )
     return solids
+
+
+def _hull(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "f 4"]:
+    """Half-spaces around points: of their convex hull, or of their box if they are flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return np.asarray(ConvexHull(points).equations)
+    except QhullError:
+        sides = np.concatenate([np.eye(3), -np.eye(3)])
+        return np.column_stack([sides, -(points @ sides.T).max(axis=0)])
 
 
 class PlacedSolids:
@@ -200,14 +220,13 @@ class PlacedSolids:
         self._centers = np.array([solid.center for solid in solids]).reshape(-1, 3)
         self._witness = np.array([solid.witness for solid in solids]).reshape(-1, 3)
         self._levers = self._lever_table()
-        # Half edges of boxes, half lengths and radii of cylinders, radii of spheres and
-        # paddings: a primitive reaches as far in a direction as these say together.
+        # Half edges of boxes, half lengths and radii of cylinders, radii of spheres: a
+        # primitive reaches as far in a direction as these say together.
         self._halves = np.zeros((len(solids), 3))
         self._rims, self._balls = np.zeros(len(solids)), np.zeros(len(solids))
         self._meshes = np.flatnonzero([solid.vertices is not None for solid in solids])
         for i, solid in enumerate(solids):
             size = solid.shape.size
-            self._balls[i] = solid.shape.padding
             if solid.shape.kind == "box":
                 self._halves[i] = 0.5 * np.array(size)
             elif solid.shape.kind == "cylinder":
@@ -234,16 +253,49 @@ class PlacedSolids:
         shape.place(self.R[i], self.t[i])
         return shape
 
-    def own_shape(self, i: int) -> Shape:
-        """The same without padding, which counts against the world only."""
-        shape = self.solids[i].own or self.solids[i].shape
-        shape.place(self.R[i], self.t[i])
-        return shape
-
     def to_link(self, i: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Express world points in the frame of a solid's link."""
         T = self._link_poses[self._row[i]]
         return (points - T[:3, 3]) @ T[:3, :3]
+
+    def from_links(
+        self, solids: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
+    ) -> Float[np.ndarray, "n 3"]:
+        """World positions of points in the frames of the links of some solids, given link by
+        link."""
+        rows = self._row[solids]
+        ends = [0, *(np.flatnonzero(np.diff(rows)) + 1).tolist(), len(rows)]
+        parts = [np.empty((0, 3))]
+        for a, b in itertools.pairwise(ends):
+            if b > a:
+                T = self._link_poses[rows[a]]
+                parts.append(points[a:b] @ T[:3, :3].T + T[:3, 3])
+        return np.concatenate(parts)
+
+    def points_within(
+        self, i: int, points: Float[np.ndarray, "n 3"], reach: Float[np.ndarray, "n"]
+    ) -> Iterator[int]:
+        """Rows of points (world) that lie in a solid, or within `reach` (metres) of it; those
+        that seem deepest first."""
+        solid, local = self.solids[i], self.to_link(i, points)
+        bound = solid.bound(local) - reach
+        rows = np.argsort(bound, kind="stable")
+        rows = rows[bound[rows] <= 0.0]
+        if solid.primitive is not None:
+            yield from rows.tolist()
+            return
+        shape = self.shape(i)
+        for row in rows.tolist():
+            if point_within(shape, points[row], float(reach[row])) or solid.holds(local[row]):
+                yield row
+
+    def point_gap(self, i: int, point: Float[np.ndarray, "3"]) -> float:
+        """Signed distance from a solid to a point (world), metres; exact."""
+        solid, local = self.solids[i], self.to_link(i, point[None])[0]
+        if solid.primitive is not None:
+            return float(solid.bound(local[None])[0])
+        way, _ = point_distance(self.shape(i), point)
+        return -way if solid.holds(local) else way
 
     def plane_gaps(self, plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n"]:
         """Signed distance from each solid to the half-space {x : n . x < offset}, exact, metres."""

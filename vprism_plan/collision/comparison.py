@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from vprism_plan.collision import _fcl
 from vprism_plan.collision._mesh_world import MeshWorld
-from vprism_plan.collision.mesh_reports import Cause, CauseKind, Comparison, Disagreement
+from vprism_plan.collision.mesh_reports import SEEN, Cause, CauseKind, Comparison, Disagreement
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.collision.reports import Contact
 from vprism_plan.errors import RobotError
@@ -193,19 +193,19 @@ def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: flo
 def _of_mesh(
     checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
 ) -> Cause:
-    kind: CauseKind = "missed by the field"
+    kind: CauseKind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
         kind = "unexplained"  # a joint limit: both know the same
     elif contact.kind == "object" and _field_allows(checker, contact):
         kind = "contact rules"
-    elif contact.kind == "object" and _draws_judge(checker):
+    elif contact.kind == "object" and contact.detail != SEEN and _draws_judge(checker):
         kind = "posterior risk"
-    elif contact.depth <= _TOLERANCE:
+    elif contact.depth <= _TOLERANCE and contact.kind not in ("occluded", "unobserved"):
         kind = "rounding"
-    elif contact.sphere < 0 and not _in_spheres(meshes, q, links, np.array(contact.position)):
+    elif contact.sphere < 0 and not _in_spheres(meshes, q, links, contact):
         kind = "solids outside spheres"
-    elif contact.kind == "object" and not _in_level_set(checker, contact):
+    elif contact.kind == "object" and not contact.detail and not _in_level_set(checker, contact):
         kind = "coarse mesh"
     return Cause(kind, contact.link, contact.body, contact.depth)
 
@@ -219,7 +219,7 @@ def _draws_judge(checker: Any) -> bool:
 def _in_level_set(checker: Any, contact: Contact) -> bool:
     """Whether the map calls the point of contact, or the deepest one behind it, occupied."""
     point = np.array(contact.position)
-    deepest = point - contact.depth * np.array(contact.normal)
+    deepest = point - max(0.0, contact.depth - contact.required) * np.array(contact.normal)
     occupied = np.asarray(checker.world.map.occupancy(np.stack([point, deepest])))
     return bool((occupied >= checker.world.config.level).any())
 
@@ -237,13 +237,16 @@ def _in_spheres(
     meshes: SurfaceChecker,
     q: Float[np.ndarray, "dof"],
     links: tuple[str, ...],
-    point: Float[np.ndarray, "3"],
+    contact: Contact,
 ) -> bool:
-    """Whether the collision spheres of each link hold a world point, to FCL's tolerance."""
+    """Whether the collision spheres of each link are as near to the place of a contact as the
+    solids are, to FCL's tolerance."""
     import torch
+
+    point, apart = np.array(contact.position), max(0.0, contact.required - contact.depth)
 
     robot = meshes.robot
     centers = robot.sphere_centers(torch.from_numpy(q)).numpy()
-    held = np.linalg.norm(centers - point, axis=1) <= robot.sphere_radii + _TOLERANCE
+    held = np.linalg.norm(centers - point, axis=1) <= robot.sphere_radii + apart + _TOLERANCE
     owners = {robot.link_names[int(link)] for link in robot.sphere_links[held]}
     return owners >= set(links)

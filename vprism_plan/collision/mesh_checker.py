@@ -2,32 +2,33 @@
 """A second opinion by FCL: the surfaces of a world against the solids of a robot.
 
 It judges the same map at the same level for the same robot, but with neither the distance
-field, nor the octree that it is traced with, nor the compiled kernels.
+field, nor the octree that it is traced with, nor the compiled kernels; and what the cameras
+saw it takes from the images, so it can contradict the map as well.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from vprism_plan._kernels.checking import FARTHEST
-from vprism_plan.collision import _fcl
-from vprism_plan.collision._mesh_queries import Queries, contact_rules
+from vprism_plan.collision import _explain, _fcl
+from vprism_plan.collision._mesh_queries import Queries
 from vprism_plan.collision._mesh_world import MeshWorld
 from vprism_plan.collision._solids import LinkShapes, PlacedSolids, robot_solids
 from vprism_plan.collision.comparison import causes_between
+from vprism_plan.collision.config import CheckerConfig
+from vprism_plan.collision.contacts import contact_rules
 from vprism_plan.collision.mesh_reports import PathFinding, PathOpinion
 from vprism_plan.collision.protocols import BakedWorld, Numbers
-from vprism_plan.collision.reports import Contact
+from vprism_plan.collision.reports import Contact, MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import Robot
 from vprism_plan.robots._values import joint_values
 
-_STEP = 0.005  # metres
 _MAX_CONFIGURATIONS = 1_000_000
 
 
@@ -36,30 +37,39 @@ class MeshChecker:
 
     What it judges: every object's surface {P(occupied) >= level} as a closed mesh, the
     support surface and known half-spaces (by formula), known primitives and meshes,
-    self-collision of the pairs the robot tests, and joint limits. What it does not know:
-    occluded and unobserved space, unlabelled clutter, seen parts too thin for the map.
-    So it is no planner's checker: it says whether the field's verdict holds for surfaces.
+    self-collision of the pairs the robot tests, and joint limits; and, by the images alone,
+    every observed point off the support surface (a ball of half its pixel's width) and, as
+    the world's policies say, hidden space. Of hidden space it asks one point per 3 cm cube of
+    the solids' surfaces, so a shadow narrower than that can be missed.
+
+    The robot is what the URDF has, scaled if the robot was scaled, whatever its spheres are.
+    Its padding is a distance to keep from the world, beside `config.margin`.
 
     FCL's meshes are hollow. A solid that no surface cuts lies wholly on one side, and the
     map's level set at one of its points says which (for known meshes: the winding number).
     Links that no joint moves are not checked against the world: they stand on it.
     Touching counts as collision. FCL's own tolerance is about 1e-5 m.
 
+    It answers the questions of `CollisionChecker` by the same names and can be given to `plan`
+    in its place, some hundred times slower, with edges checked at discrete configurations.
     Not safe to share between threads: shapes are moved while they are asked about.
 
     Args:
         world: what to avoid.
         robot: whose configurations are asked about.
+        config: margins and allowed contacts. `max_risk` is not judged (nothing is drawn here),
+            and `min_motion` says nothing of what is sampled by `step`.
         links: "geometry": the URDF's meshes, boxes, cylinders and spheres, or `link_meshes`,
             and the collision spheres of links that have neither (or whose meshes are missing,
-            in more than 20 pieces, or of a link that was padded or scaled). "spheres": the
-            collision spheres of every link.
+            or in more than 20 pieces). "spheres": the collision spheres of every link.
         link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres, in place of its
-            primitives. They are taken as they are: the robot's padding does not grow them.
-        allowed_contacts: link or SRDF group -> ids of the objects that it may touch.
+            primitives.
         resolution: edge of the objects' marching cubes, metres. None: the lattice of the
             world's distance field (a quarter of its resolution), on which no mesh reaches
             beyond what the field encloses. A coarser mesh is made sooner, and may.
+        step: motion, metres, that no point of the robot exceeds between two configurations of
+            an edge: a collision may hide in at most half of that.
+        seen: False leaves observed points and hidden space out: surfaces alone.
 
     Raises:
         MissingDependencyError: python-fcl is not installed.
@@ -71,72 +81,142 @@ class MeshChecker:
         self,
         world: BakedWorld,
         robot: Robot,
+        config: CheckerConfig | None = None,
         *,
         links: LinkShapes = "geometry",
         link_meshes: Mapping[str, Any] | None = None,
-        allowed_contacts: Mapping[str, Collection[int]] | None = None,
         resolution: float | None = None,
+        step: float = 0.005,
+        seen: bool = True,
     ) -> None:
         _fcl.fcl()
+        if not (math.isfinite(step) and step >= 1e-5):
+            raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
+        self._made_of = world, robot, config, links, link_meshes, resolution, step, seen
+        if hasattr(world, "for_base"):
+            world = world.for_base(robot.base_pose[:3, 3])
         self.world = world
         self.robot = robot
+        self.config = CheckerConfig() if config is None else config
         self.links = links
+        self.step = float(step)
         self.solids = robot_solids(robot, links, link_meshes)
         self.surfaces = MeshWorld(world, resolution)
         self.placed = PlacedSolids(robot, self.solids)
-        rules = contact_rules(robot, world.map.object_ids, allowed_contacts or {})
-        self._queries = Queries(world, self.placed, self.surfaces, rules)
-        bounded = ~np.asarray(robot.continuous)
-        self._arguments = world, robot, links, link_meshes, allowed_contacts, resolution
-        self._lower = np.where(bounded, robot.lower, -FARTHEST)
-        self._upper = np.where(bounded, robot.upper, FARTHEST)
+        rules = self._allowed_classes()
+        self._queries = Queries(world, self.placed, self.surfaces, rules, self.config, seen)
 
     def __reduce__(self) -> Any:
         """A copy is made anew: FCL's objects cannot be copied."""
-        return _made, self._arguments
+        return _made, self._made_of
 
     @classmethod
     def like(cls, checker: Any, **options: Any) -> "MeshChecker":
-        """Make the second opinion on a `CollisionChecker`: its world, robot and contact rules.
+        """Make the second opinion on a `CollisionChecker`: its world, robot, margins and rules.
+
+        What its edges may miss (`config.tolerance`) is taken off the margins: paths are
+        shaved down to them.
 
         Args:
             checker: a `CollisionChecker`.
             **options: as for `MeshChecker`.
         """
-        options.setdefault("allowed_contacts", dict(checker.config.allowed_contacts))
+        config = checker.config
+        margins = {
+            name: max(0.0, getattr(config, name) - config.tolerance)
+            for name in ("margin", "self_margin")
+        }
+        options.setdefault("config", replace(config, **margins))
         return cls(checker.world, checker.robot, **options)
 
-    # --- one configuration -------------------------------------------------------
+    def _allowed_classes(self) -> Bool[np.ndarray, "links classes"]:
+        """Which link may touch which class of the map; column 0, all else, is never allowed."""
+        object_ids = list(self.world.map.object_ids)
+        rules, index = contact_rules(self.robot, self.config.allowed_contacts)
+        unknown = sorted(set().union(*rules) - set(object_ids))
+        if unknown:
+            raise ConfigError(
+                f"allowed_contacts names object {unknown[0]}; the map has {object_ids}"
+            )
+        table = np.array([[False, *(i in rule for i in object_ids)] for rule in rules])
+        return np.asarray(table[index])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is usable but odd about the world and the robot; every verdict carries it."""
+        found = (*getattr(self.world, "warnings", ()), *getattr(self.robot, "warnings", ()))
+        return tuple(dict.fromkeys(found))
+
+    # --- configurations ----------------------------------------------------------
 
     def is_valid(self, q: Numbers) -> bool:
-        """Return whether no solid touches a surface or another link, within joint limits.
+        """Return whether every solid keeps its distances, within joint limits.
+
+        Returns:
+            False also for a configuration that is not finite.
 
         Raises:
-            RobotError: q does not have shape (dof,) or is not finite.
+            RobotError: q does not have shape (dof,).
         """
-        q = self.robot.check_configuration(q)
-        if (q < self._lower).any() or (q > self._upper).any():
+        return self.is_valid_buffer(self._configuration(q))
+
+    def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
+        """`is_valid` without looking at the shape."""
+        if _explain.limit_contacts(self.robot, q):
             return False
         self.placed.place(q)
         return not self._queries.collides()
 
-    def distance(self, q: Numbers) -> float:
+    def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
+        """Return `is_valid` for each row of Q (n, dof)."""
+        return np.array([self.is_valid_buffer(q) for q in self._configurations(Q)], dtype=bool)
+
+    def clearance(self, q: Numbers) -> float:
         """Return the distance from the moving links to the nearest surface, metres.
 
-        At most 0 exactly when a moving link touches the world. Self-collision, joint
-        limits and what `allowed_contacts` permits do not enter; inf if there is nothing.
+        At most 0 exactly when a moving link touches the world. The margin is not subtracted,
+        padding is; self-collision, joint limits and what `allowed_contacts` permits do not
+        enter. inf if there is nothing.
 
-        Apart, the figure is FCL's distance, exact for what is compared. In touch it is
-        what FCL can say: exact depth for half-spaces, for spheres against anything, and
-        between primitives; 0 for a box, cylinder or mesh that crosses a mesh's surface
-        (FCL has no depth for that); minus the gap to the surface for one wholly inside.
+        Apart, the figure is FCL's distance, exact for what is compared; of hidden space only
+        that a link is in it is known (0). In touch it is what FCL can say: exact depth for
+        half-spaces, for spheres against anything, and between primitives; 0 for a box,
+        cylinder or mesh that crosses a mesh's surface (FCL has no depth for that); minus the
+        gap to the surface for one wholly inside.
 
         Raises:
             RobotError: q does not have shape (dof,) or is not finite.
         """
-        q = self.robot.check_configuration(q)
-        self.placed.place(q)
-        return self._queries.distance()
+        self.placed.place(self.robot.check_configuration(q))
+        return self._queries.clearance()
+
+    def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+        """Return `clearance` for each row of Q (n, dof), metres."""
+        return np.array([self.clearance(q) for q in self._configurations(Q)], dtype=np.float64)
+
+    def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+        """Return the smallest gap between links that may collide, for each row of Q, metres."""
+        found = []
+        for q in self._configurations(Q):
+            self.placed.place(self.robot.check_configuration(q))
+            found.append(self._queries.self_clearance())
+        return np.array(found, dtype=np.float64)
+
+    def explain(self, q: Numbers) -> StateReport:
+        """Return the verdict on a configuration with every reason that refuses it.
+
+        Raises:
+            RobotError: q does not have shape (dof,).
+        """
+        q = self._configuration(q)
+        return _explain.report(
+            self,
+            q,
+            lambda: list(self.contacts(q)),
+            tuple,
+            lambda: self._permitted(q),
+            lambda: self._sphere_centers(q),
+        )
 
     def contacts(self, q: Numbers) -> tuple[Contact, ...]:
         """Return every reason to refuse q: the deepest contact of each link and body.
@@ -151,15 +231,17 @@ class MeshChecker:
             Deepest first; empty exactly if `is_valid(q)`. `sphere` is -1 for solids.
 
         Raises:
-            RobotError: q does not have shape (dof,) or is not finite.
+            RobotError: q does not have shape (dof,).
         """
-        q = self.robot.check_configuration(q)
-        self.placed.place(q)
-        reasons = [*self._queries.contacts(), *self._limit_contacts(q)]
+        q = self._configuration(q)
+        reasons = _explain.limit_contacts(self.robot, q)
+        if np.isfinite(q).all():
+            self.placed.place(q)
+            reasons += self._queries.contacts()
         return tuple(sorted(reasons, key=lambda contact: -contact.depth))
 
     def link_distance(self, q: Numbers, link: str, body: str) -> float:
-        """Return the distance from one link to one body, metres, as `distance` states it.
+        """Return the distance from one link to one body, metres, as `clearance` states it.
 
         Args:
             q: (dof,) configuration.
@@ -182,21 +264,46 @@ class MeshChecker:
 
     # --- motions -----------------------------------------------------------------
 
-    def check_motion(self, qa: Numbers, qb: Numbers, step: float = _STEP) -> bool:
+    def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
         """Return whether the straight edge from qa to qb is free at discrete configurations.
 
-        Between two of them no point of the robot moves more than `step` metres, so a
-        collision may hide in at most half of that. (FCL's continuous check crashes or
-        misses with meshes, and is not used.)
+        Between two of them no point of the robot moves more than `step` metres. (FCL's
+        continuous check crashes or misses with meshes, and is not used.) The edge means what
+        its ends say, as for `CollisionChecker`.
 
         Raises:
-            RobotError: an end does not have shape (dof,) or is not finite.
-            ConfigError: step is out of range.
+            RobotError: an end does not have shape (dof,).
+            ConfigError: the step asks for too many configurations.
         """
-        qa, qb = (self.robot.check_configuration(q) for q in (qa, qb))
-        return all(self.is_valid(qa + t * (qb - qa)) for t in self._fractions(qa, qb, step))
+        return self.check_motion_buffer(self._configuration(qa), self._configuration(qb))
 
-    def check_path(self, path: Numbers, step: float = _STEP) -> PathOpinion:
+    def check_motion_buffer(
+        self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
+    ) -> bool:
+        """`check_motion` without looking at shapes."""
+        return all(self.is_valid_buffer(q) for _, q in self._between(qa, qb))
+
+    def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
+        """Return the verdict on an edge, how far apart it was looked at, and the reason."""
+        qa, qb = self._configuration(qa), self._configuration(qb)
+        checked, refused, state = 0, None, None
+        for t, q in self._between(qa, qb):
+            checked += 1
+            if not self.is_valid_buffer(q):
+                refused, state = t, self.explain(q)
+                break
+        finite = np.isfinite(qa).all() and np.isfinite(qb).all()
+        return MotionReport(
+            valid=refused is None,
+            certified=False,
+            tolerance=0.5 * self.step,
+            collision_fraction=refused,
+            configurations=checked,
+            motion_bound=self.placed.motion_bound(qb - qa) if finite else math.inf,
+            state=state,
+        )
+
+    def check_path(self, path: Numbers) -> PathOpinion:
         """Check every edge of a path (T, dof) as `check_motion` does.
 
         Returns:
@@ -204,7 +311,7 @@ class MeshChecker:
 
         Raises:
             RobotError: path does not have shape (T, dof), T >= 1, or is not finite.
-            ConfigError: step is out of range.
+            ConfigError: the step asks for too many configurations.
         """
         rows = joint_values(path, self.robot, "a path")
         if rows.ndim != 2 or len(rows) == 0:
@@ -215,61 +322,87 @@ class MeshChecker:
         ends = pairwise(rows) if len(rows) > 1 else iter([(rows[0], rows[0])])
         findings, checked = [], 0
         for edge, (qa, qb) in enumerate(ends):
-            for t in self._fractions(qa, qb, step):
+            for t in self._fractions(qa, qb):
                 checked += 1
                 q = qa + t * (qb - qa)
-                if not self.is_valid(q):
+                if not self.is_valid_buffer(q):
                     values = tuple(float(v) for v in q)
                     findings.append(PathFinding(edge, float(t), values, self.contacts(q)))
                     break
-        return PathOpinion(not findings, float(step), checked, tuple(findings))
+        return PathOpinion(not findings, self.step, checked, tuple(findings))
 
-    def review(self, checker: Any, path: Numbers, step: float = _STEP) -> PathOpinion:
+    def review(self, checker: Any, path: Numbers) -> PathOpinion:
         """Check a path that another checker accepted, and say why the two disagree.
 
         Args:
             checker: the `CollisionChecker` that accepted it.
             path: (T, dof) waypoints.
-            step: metres, as for `check_motion`.
 
         Returns:
             `check_path`, with the causes of each disagreement as `compare` names them;
             "edge tolerance" where the checker refuses the very configuration, too, and
             accepted the edge within its tolerance.
         """
-        opinion = self.check_path(path, step)
+        opinion = self.check_path(path)
         findings = tuple(
             replace(found, causes=causes_between(checker, self, np.array(found.configuration)))
             for found in opinion.findings
         )
         return replace(opinion, findings=findings)
 
-    def _fractions(self, qa: np.ndarray, qb: np.ndarray, step: float) -> Float[np.ndarray, "n"]:
+    def _fractions(self, qa: np.ndarray, qb: np.ndarray) -> Float[np.ndarray, "n"]:
         """Where to look on an edge: no point of the robot moves more than `step` in between."""
-        if not (math.isfinite(step) and step >= 1e-5):
-            raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
-        pieces = max(1, math.ceil(self.placed.motion_bound(qb - qa) / step))
+        pieces = max(1, math.ceil(self.placed.motion_bound(qb - qa) / self.step))
         if pieces > _MAX_CONFIGURATIONS:
             raise ConfigError(
-                f"step {step} m asks for {pieces:,} configurations on one edge (at most "
+                f"step {self.step} m asks for {pieces:,} configurations on one edge (at most "
                 f"{_MAX_CONFIGURATIONS:,}); use a larger one"
             )
         return np.linspace(0.0, 1.0, pieces + 1)
 
-    def _limit_contacts(self, q: Float[np.ndarray, "dof"]) -> list[Contact]:
-        found = []
-        for j in np.flatnonzero((q < self._lower) | (q > self._upper)):
-            name = self.robot.joint_names[j]
-            excess = float(max(self._lower[j] - q[j], q[j] - self._upper[j]))
-            detail = (
-                f"joint {name} is {q[j]:.10g}, outside its limits "
-                f"[{self._lower[j]:.10g}, {self._upper[j]:.10g}]"
+    def _between(
+        self, qa: np.ndarray, qb: np.ndarray
+    ) -> Iterator[tuple[float, Float[np.ndarray, "dof"]]]:
+        """Where to look and what is there: both ends, then each time the middles of what is
+        left. Who gets an invalid end asks no further."""
+        yield 0.0, qa
+        yield 1.0, qb
+        fractions = self._fractions(qa, qb)
+        spans = [(0, len(fractions) - 1)]
+        while spans:
+            middles = [(a, (a + b) // 2, b) for a, b in spans if b - a > 1]
+            for _, m, _ in middles:
+                yield float(fractions[m]), qa + fractions[m] * (qb - qa)
+            spans = [span for a, m, b in middles for span in ((a, m), (m, b))]
+
+    # --- small helps -------------------------------------------------------------
+
+    def _configuration(self, q: Numbers) -> Float[np.ndarray, "dof"]:
+        array = joint_values(q, self.robot, "a configuration")
+        if array.shape != (self.robot.dof,):
+            return self.robot.check_configuration(array)  # which says what is wrong
+        return array
+
+    def _configurations(self, Q: Numbers) -> Float[np.ndarray, "n dof"]:
+        array = joint_values(Q, self.robot, "configurations")
+        if array.ndim != 2 or array.shape[1] != self.robot.dof:
+            raise RobotError(
+                f"configurations have shape {array.shape}; {self.robot.name} needs "
+                f"(n, {self.robot.dof}): {', '.join(self.robot.joint_names)}"
             )
-            found.append(Contact("joint_limit", name, "joint_limit", excess, detail=detail))
-        return found
+        return array
+
+    def _permitted(self, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+        self.placed.place(q)
+        return self._queries.permitted()
+
+    def _sphere_centers(self, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
+        import torch
+
+        return np.asarray(self.robot.sphere_centers(torch.from_numpy(q)).numpy())
 
 
-def _made(world: BakedWorld, robot: Robot, *options: Any) -> MeshChecker:
+def _made(world: BakedWorld, robot: Robot, config: Any, *options: Any) -> MeshChecker:
     """Make a checker of its arguments in order."""
-    names = ("links", "link_meshes", "allowed_contacts", "resolution")
-    return MeshChecker(world, robot, **dict(zip(names, options, strict=True)))
+    names = ("links", "link_meshes", "resolution", "step", "seen")
+    return MeshChecker(world, robot, config, **dict(zip(names, options, strict=True)))

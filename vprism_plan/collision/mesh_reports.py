@@ -23,26 +23,30 @@ CauseKind = Literal[
     "rounding",
     "edge tolerance",
     "missed by the field",
+    "seen by a camera",
     # either
     "contact rules",
     "posterior risk",
     "unexplained",
 ]
 
+SEEN = "a camera saw it there"  # the detail of contacts with observed points
 _SPOKEN: dict[str, str] = {
     "conservative spheres": "the link's spheres reach it, its solids do not",
     "margin": "nothing touches, but the field's checker keeps a margin",
     "voxel inflation": "the field's cells reach beyond the surface",
-    "occluded": "meshes know nothing of what no camera saw",
-    "unobserved": "meshes know nothing of where no camera looked",
-    "background": "meshes know nothing of unlabelled clutter",
-    "thin seen part": "a part was seen that the map smooths away",
+    "occluded": "no camera saw it, and meshes touch nothing that they ask about",
+    "unobserved": "no camera looked there, and meshes touch nothing that they ask about",
+    "background": "its cells reach farther than the points of the unlabelled clutter",
+    "thin seen part": "its cells reach farther than the points of a part that the map smooths away",
     "too small for the mesh": "the object has no surface on the mesh's lattice",
     "solids outside spheres": "the link's spheres do not hold its solids",
     "coarse mesh": "the mesh reaches beyond the level set",
     "rounding": "the two differ by less than FCL's tolerance",
     "edge tolerance": "the field refuses it, too, and accepted the edge within its tolerance",
-    "missed by the field": "the map says occupied and the field says free",
+    "missed by the field": "the map, or the shadow of what was seen, says occupied and the field "
+    "says free",
+    "seen by a camera": "the checker missed what a camera saw there",
     "contact rules": "the two permit different contacts",
     "posterior risk": "posterior worlds judge the objects",
     "unexplained": "no known cause",

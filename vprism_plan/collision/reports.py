@@ -49,6 +49,8 @@ class Contact:
             share of the posterior worlds in which this link touches this body); None where
             the cause is not the map's to judge (self, limits, known geometry).
         detail: The rule that decided, in words.
+        required: Distance that was asked for, metres: the margin and the link's padding. So
+            `required - depth` is how far apart the two are, negative where they overlap.
     """
 
     kind: Kind
@@ -60,6 +62,7 @@ class Contact:
     normal: tuple[float, float, float] | None = None
     probability: float | None = None
     detail: str = ""
+    required: float = 0.0
 
     def text(self) -> str:
         """Return the reason as one phrase."""
@@ -76,7 +79,13 @@ class Contact:
         sure = "" if self.probability is None else f", P(occupied) {self.probability:.2f}"
         why = f" ({self.detail})" if self.detail else ""
         body = _SPOKEN.get(self.body, self.body)
-        return f"{self.link} is {1000 * self.depth:.1f} mm into {body}{at}{sure}{why}"
+        way = f"{1000 * abs(self.required - self.depth):.1f}"
+        if way == "0.0":
+            return f"{self.link} touches {body}{at}{sure}{why}"
+        if self.depth > self.required:
+            return f"{self.link} is {way} mm into {body}{at}{sure}{why}"
+        asked = f"{1000 * self.required:.1f} mm asked for"
+        return f"{self.link} is {way} mm from {body}, {asked}{at}{sure}{why}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready keys of moveit_msgs/ContactInformation, and ours."""
@@ -88,6 +97,7 @@ class Contact:
             "position": self.position,
             "normal": self.normal,
             "depth": self.depth,
+            "required": self.required,
             "kind": self.kind,
             "sphere": self.sphere,
             "probability": self.probability,

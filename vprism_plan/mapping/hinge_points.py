@@ -35,7 +35,8 @@ def lattice_hinges(
         if np.prod(last - first + 1.0) > 50.0 * config.max_hinges:
             raise MapError(
                 f"an object's box is {np.round(high - low, 3).tolist()} m wide, too many hinge "
-                f"points at {spacing} m; check its labels, or raise hinge_spacing"
+                f"points at {spacing} m; check its labels and the scale of depth (metres), or "
+                "raise hinge_spacing"
             )
         axes = [np.arange(a, b + 1.0) for a, b in zip(first, last, strict=True)]
         index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

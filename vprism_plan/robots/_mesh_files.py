@@ -7,7 +7,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +61,12 @@ class MeshFile:
                 "(folders that hold the packages), or spheres= to do without the mesh"
             )
         return self.path
+
+    def scaled(self, about: Float[np.ndarray, "3"], factor: float) -> MeshFile:
+        """The same mesh larger or smaller by a factor, about a point of the link's frame."""
+        T = self.T_link.copy()
+        T[:3, 3] = about + factor * (T[:3, 3] - about)
+        return replace(self, scale=factor * self.scale, T_link=T)
 
     def mesh(self) -> Any:
         """The mesh as a ``trimesh.Trimesh`` in the link's frame, metres, vertices merged.

@@ -38,26 +38,24 @@ def padded(
         if robot.disabled_pairs.get(pair) == NEVER and pair & larger
     ]
     arrays = dataclasses.replace(arrays, pairs=_with_pairs(arrays.pairs, again, names))
-    geometry = dict(robot.geometry)
+    geometry, meshes = dict(robot.geometry), dict(robot.meshes)
     for index, name in enumerate(names):
+        T, scale = robot._links[name].T, float(scales[index])
+        about = (robot.arrays.link_center[index] - T[:3, 3]) @ T[:3, :3]
         if name in geometry:
-            T = robot._links[name].T
-            about = (robot.arrays.link_center[index] - T[:3, 3]) @ T[:3, :3]
-            geometry[name] = grown_solids(
-                geometry[name], about, float(scales[index]), float(pads[index])
-            )
+            geometry[name] = grown_solids(geometry[name], about, scale, float(pads[index]))
+        if name in meshes and scale != 1.0:
+            meshes[name] = tuple(file.scaled(about, scale) for file in meshes[name])
     before = touching_pairs(robot.arrays, robot.neutral, names)
     touching = touching_pairs(arrays, robot.neutral, names) - before
     if touching:
         _logger.warning("the scale makes links touch in the neutral state: %s", sorted(touching))
-    changed = {name for i, name in enumerate(names) if scales[i] != 1.0 or pads[i] > 0.0}
     return dataclasses.replace(
         robot,
         arrays=arrays,
         disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if p not in again},
         geometry=geometry,
-        # Nothing grows a mesh; who wants solids takes the spheres, which did grow.
-        meshes={name: files for name, files in robot.meshes.items() if name not in changed},
+        meshes=meshes,
         _torch=TorchKinematics(arrays),
     )
 

@@ -58,14 +58,23 @@ def surface_samples(
     triangles: Float[np.ndarray, "f 3 3"], count: int = _SAMPLES, seed: int = 0
 ) -> Float[np.ndarray, "n 3"]:
     """Points of a surface: `count` uniform by area, and every corner."""
+    points, _ = drawn_points(triangles, count, seed)
+    return np.concatenate([points, triangles.reshape(-1, 3)])
+
+
+def drawn_points(
+    triangles: Float[np.ndarray, "f 3 3"], count: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of a surface, uniform by area, and the unit normals of their triangles."""
     rng = np.random.default_rng(seed)
     edges = triangles[:, 1:] - triangles[:, :1]
-    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    area = np.linalg.norm(normal, axis=1)
     which = rng.choice(len(triangles), size=count, p=area / area.sum())
     share = rng.random((count, 2))
     share = np.where(share.sum(axis=1, keepdims=True) > 1.0, 1.0 - share, share)
     points = triangles[which, 0] + np.einsum("nk,nkj->nj", share, edges[which])
-    return np.concatenate([points, triangles.reshape(-1, 3)])
+    return points, normal[which] / area[which, None]
 
 
 def sphere_gap(

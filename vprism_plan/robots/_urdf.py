@@ -189,7 +189,11 @@ def _axis(element: Any, path: Path) -> np.ndarray:
 
 
 def _limits(element: Any, path: Path) -> tuple[float, float, float]:
-    """Lower, upper and velocity limit; a velocity of 0 or none stated becomes inf."""
+    """Lower, upper and velocity limit; a velocity of 0 or none stated becomes inf.
+
+    Soft limits of a <safety_controller> narrow the range, as MoveIt has it: beyond them a
+    controller pushes back. Continuous joints have none.
+    """
     limit, name = element.limit, element.name
     velocity = math.inf
     if limit is not None and limit.velocity is not None:
@@ -218,5 +222,15 @@ def _limits(element: Any, path: Path) -> tuple[float, float, float]:
         raise RobotError(
             f"joint '{name}' in '{path}' has limits [{lower:g}, {upper:g}], beyond "
             f"{_FARTHEST_LIMIT:g}; no search covers that: make it continuous, or state real limits"
+        )
+    soft = element.safety_controller
+    low = getattr(soft, "soft_lower_limit", None)
+    high = getattr(soft, "soft_upper_limit", None)
+    low, high = (lower if low is None else low), (upper if high is None else high)
+    lower, upper = max(lower, low), min(upper, high)
+    if not (math.isfinite(low) and math.isfinite(high) and lower <= upper):
+        raise RobotError(
+            f"joint '{name}' in '{path}' has a <safety_controller> whose soft limits "
+            f"[{low:g}, {high:g}] leave nothing of its range; correct them, or take it out"
         )
     return lower, upper, velocity

@@ -71,8 +71,8 @@ class Robot:
         arrays: The flat form that compiled kernels read.
         links_with_meshes: Links whose collision geometry has meshes: what ``geometry``
             holds of them is not the whole link.
-        meshes: Link name -> its collision meshes, read when they are asked for; links that
-            were scaled or padded are left out.
+        meshes: Link name -> its collision meshes, read when they are asked for; scaled as
+            the robot is, without its padding, by which nothing grows a mesh.
         link_spheres: Link name -> (n, 4) rows (x, y, z, radius) in the link's frame: the
             spheres as they were read or fitted, without padding, scale and attached objects.
         sphere_sources: Link name -> where its spheres are from: "file", "urdf", "tiled"

@@ -147,6 +147,12 @@ def _view(
     )
 
 
+def shadow_behind(observation: Observation, start: Float[np.ndarray, "h w"]) -> View:
+    """A view by which exactly what lies behind the depth `start` (metres, inf for nothing) of a
+    pixel is hidden."""
+    return _view(observation, start, np.ones(start.shape, dtype=bool))
+
+
 def behind(
     observation: Observation,
     start: Float[np.ndarray, "h w"],
@@ -159,8 +165,7 @@ def behind(
 
     Pixels with an infinite `start` hide nothing.
     """
-    view = _view(observation, start, np.ones(start.shape, dtype=bool))
-    status = classify_cells([view], plane, origin, spacing, shape)
+    status = classify_cells([shadow_behind(observation, start)], plane, origin, spacing, shape)
     return (status == kernels.OCCLUDED) | (status == kernels.PARTLY)
 
 

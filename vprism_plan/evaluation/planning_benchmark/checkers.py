@@ -80,8 +80,7 @@ class Bench:
         if contender.meshes:
             from vprism_plan.evaluation.planning_benchmark.fcl_checker import FclChecker
 
-            robot = self.robot.with_padding(margin) if margin else self.robot
-            return FclChecker(world, robot, contender.step)
+            return FclChecker(world, self.robot, contender.step, margin)
         # 256 worlds without a collision cannot show a risk below 0.0148.
         draws = 512 if risk is not None and risk < 0.015 else 256
         config = CheckerConfig(margin=margin, max_risk=risk, n_worlds=draws)
