@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles.perception_oracles import Scene, intrinsics, look_at, spoil
+from oracles.perception_oracles import (
+    Scene,
+    bin_walls,
+    intrinsics,
+    look_at,
+    shelf_walls,
+    spoil,
+)
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import ConfigError, PlaneNotFoundError
@@ -73,6 +80,65 @@ def test_a_larger_wall_and_floor_behind_are_not_the_table(labels):
     plane = fit_plane(obs).transformed(look_at((-1.0, 0.0, 0.6)))
     assert angle(plane.normal, np.array([0, 0, 1.0])) < 0.5
     assert abs(plane.offset) < 0.005
+
+
+def things(spots, seed, height=(0.03, 0.07)):
+    """Boxes of 2 to 6 cm around the given (x, y), standing at z = 0."""
+    rng = np.random.default_rng(seed)
+    boxes = []
+    for x, y in spots:
+        spot = np.array([x, y]) + rng.uniform(-0.01, 0.01, 2)
+        half = rng.uniform(0.01, 0.03, 2)
+        boxes.append(((*(spot - half), 0.0), (*(spot + half), rng.uniform(*height))))
+    return boxes
+
+
+def assert_level_at_zero(scene, eye, target, seed, labels=True, posed=True):
+    pose = look_at(eye, target)
+    depth, ids = scene.render(pose, K)
+    noisy, _ = spoil(depth, np.random.default_rng(seed), noise=0.002)
+    obs = Observation(noisy, ids if labels else None, K, pose if posed else None)
+    plane = fit_plane(obs, seed=seed) if posed else fit_plane(obs, seed=seed).transformed(pose)
+    assert angle(plane.normal, np.array([0, 0, 1.0])) < 1.0
+    assert abs(plane.signed_distance(np.zeros(3))) < 0.006
+
+
+@pytest.mark.parametrize("slope", [35, 45, 55, 65, 80])
+@pytest.mark.parametrize(("distance", "lean"), [(0.45, 0), (0.6, 25), (0.8, 10)])
+def test_the_floor_of_a_bin_not_its_wall(slope, distance, lean):
+    seed = slope + lean
+    half, raised = (0.16, 0.09), (-0.08 if lean else None)
+    boxes = things([(0.05, 0.02), (-0.08, -0.03), (-0.03, 0.05)], seed)
+    lower, upper = (-half[0], -half[1]), half
+    scene = Scene([], boxes, (lower, upper), raised, panels=bin_walls(slope, half))
+    eye = (-distance * np.sin(np.radians(lean)) - 0.003, 0.0, distance * np.cos(np.radians(lean)))
+    assert_level_at_zero(scene, eye, (0, 0, 0), seed)
+
+
+@pytest.mark.parametrize("slope", [35, 55, 80])
+@pytest.mark.parametrize(("labels", "posed"), [(False, True), (True, False)])
+def test_the_floor_of_a_bin_by_gravity_or_by_what_stands_on_it(slope, labels, posed):
+    boxes = things([(0.05, 0.02), (-0.08, -0.03), (-0.03, 0.05)], slope)
+    lower, upper = (-0.16, -0.09), (0.16, 0.09)
+    scene = Scene([], boxes, (lower, upper), panels=bin_walls(slope))
+    assert_level_at_zero(scene, (-0.003, 0.0, 0.6), (0, 0, 0), slope, labels, posed)
+
+
+@pytest.mark.parametrize("distance", [0.45, 0.6, 0.8])
+@pytest.mark.parametrize("above", [0.12, 0.2, 0.3])
+@pytest.mark.parametrize("width", [0.5, 0.9])
+def test_the_board_of_a_shelf_not_its_back(distance, above, width):
+    seed = int(100 * (distance + above))
+    boxes = things([(0.02, -0.15), (-0.06, 0.0), (0.06, 0.13)], seed, (0.06, 0.2))
+    half = (0.15, width / 2)
+    floor = -0.9 if width == 0.5 else None
+    table = ((-half[0], -half[1]), half)
+    scene = Scene([], boxes, table, floor, panels=shelf_walls(width))
+    eye = (-np.sqrt(distance**2 - above**2), 0.03, above)
+    assert_level_at_zero(scene, eye, (0, 0, 0.08), seed)
+    if distance == 0.6:
+        assert_level_at_zero(scene, eye, (0, 0, 0.08), seed, labels=False)
+        assert_level_at_zero(scene, eye, (0, 0, 0.08), seed, posed=False)
 
 
 def test_precision_of_the_depth_does_not_matter():

@@ -219,6 +219,21 @@ def test_too_large_a_grid_is_refused_with_a_remedy():
         World(random_map(0), WorldConfig(known=(floor,), **FREE))
 
 
+def test_too_large_a_grid_is_refused_before_the_level_set_is_traced(monkeypatch):
+    def traced(*_):
+        raise AssertionError("traced")
+
+    monkeypatch.setattr("vprism_plan.world.world.trace_level_set", traced)
+    with pytest.raises(WorldError, match="coarser resolution"):
+        World(random_map(2), WorldConfig(resolution=1e-4))
+
+
+def test_too_fine_a_level_set_is_refused_before_it_fills_the_memory():
+    small = ((0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
+    with pytest.raises(WorldError, match=r"cells of 0\.0001 m"):
+        World(random_map(2), WorldConfig(resolution=1e-4, bounds=small))
+
+
 def test_status_and_bounds_refuse_points_that_are_not_finite():
     world = World(random_map(0), WorldConfig(**FREE))
     for question in (world.status, world.field.lower_bound, world.field.source_at):

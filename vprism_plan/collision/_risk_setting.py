@@ -3,6 +3,7 @@
 
 import dataclasses
 from collections.abc import Collection, Sequence
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,6 +21,28 @@ PADDINGS = (0.5, 1.0, 2.0)
 _ROOM = 3.0
 
 
+class Certain:
+    """What is an obstacle in every world, under each contact rule; baked when it is asked for.
+
+    Baking takes longer than drawing worlds, and who only counts draws never asks.
+    """
+
+    def __init__(self, world: RuledWorld, rules: Sequence[Collection[int]]) -> None:
+        self._world = world
+        self._rules = tuple(rules)
+
+    @cached_property
+    def fields(self) -> tuple[NodeField, ...]:
+        """Distance to it, one field per contact rule."""
+        return tuple(self._world.certain_field(ids) for ids in self._rules)
+
+    @cached_property
+    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for the kernels: distances, block bounds, floats."""
+        baked = pack_world(self._world, self.fields, 0.0)
+        return baked.distance, baked.blocks, baked.floats
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setting:
     """A robot among the worlds of one map.
@@ -32,10 +55,10 @@ class Setting:
         radii: (S,) metres.
         tables: (rules,) the table of `worlds` that holds for each contact rule.
         sphere_tables: (S,) the table that holds for each sphere; -1 is not checked.
-        fields: distance to the certain obstacles, one per contact rule.
-        packed: the same for the kernels: distances, block bounds, floats.
+        certain: what is an obstacle in every world.
         floats, ints: the robot for the kernels, without joint limits and link pairs.
         spacing: no sphere centre moves more than this between two samples, metres.
+        margin: metres to keep from what is certain; in `radii` already.
     """
 
     world: RuledWorld
@@ -45,20 +68,30 @@ class Setting:
     radii: Float[np.ndarray, " s"]
     tables: Int[np.ndarray, " g"]
     sphere_tables: Int[np.ndarray, " s"]
-    fields: tuple[NodeField, ...]
-    packed: tuple[np.ndarray, np.ndarray, np.ndarray]
+    certain: Certain
     floats: Float[np.ndarray, " f"]
     ints: Int[np.ndarray, " i"]
     spacing: float
+    margin: float = 0.0
+
+    @property
+    def fields(self) -> tuple[NodeField, ...]:
+        """Distance to the certain obstacles, one per contact rule."""
+        return self.certain.fields
+
+    @cached_property
+    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for the kernels, with the margin: distances, block bounds, floats."""
+        distance, blocks, floats = self.certain.packed
+        floats = floats.copy()
+        floats[6] += self.margin
+        return distance, blocks, floats
 
 
 def with_margin(setting: Setting, margin: float) -> Setting:
     """Return the same for spheres that must keep `margin` (metres) more than not touching."""
-    distance, blocks, floats = setting.packed
-    floats = floats.copy()
-    floats[6] += margin
     return dataclasses.replace(
-        setting, radii=setting.radii + margin, packed=(distance, blocks, floats)
+        setting, radii=setting.radii + margin, margin=setting.margin + margin
     )
 
 
@@ -87,8 +120,6 @@ def make_setting(
     worlds = world.posterior_worlds(config.n_worlds, config.risk_seed, reach=reach)
     tables = np.array([worlds.rule(ids) for ids in rules], dtype=np.int64)
     per_link = np.where(arrays.link_fixed, -1, tables[link_rules])
-    fields = tuple(world.certain_field(ids) for ids in rules)
-    baked = pack_world(world, fields, 0.0)
     alone = dataclasses.replace(arrays, pairs=np.empty((0, 2), np.int64))
     packed = pack_robot(alone, rules=link_rules)
     _open_limits(packed.floats, packed.ints)
@@ -100,8 +131,7 @@ def make_setting(
         radii=radii,
         tables=tables,
         sphere_tables=per_link[arrays.sphere_link].astype(np.int64),
-        fields=fields,
-        packed=(baked.distance, baked.blocks, baked.floats),
+        certain=Certain(world, rules),
         floats=packed.floats,
         ints=packed.ints,
         spacing=min(resolution, 0.5 * float(world.map.kernel_length)),

@@ -12,6 +12,7 @@ import numpy as np
 
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import _files
+from vprism_plan.perception._distortion import read_distortion, undistort
 from vprism_plan.perception._validation import check_pose
 from vprism_plan.perception.camera import invert_transform
 from vprism_plan.perception.observation import Observation
@@ -31,12 +32,14 @@ def load_bop(scene: Path, frame: int | None) -> Observation:
     raw = _files.read_depth_image(_existing(scene / "depth", stem, (".png", ".tif")))
     scale = _files.positive_number(camera, "depth_scale", path, default=1.0)
     color = _optional(scene / "rgb", stem, (".png", ".jpg"))
+    intrinsics = _files.matrix(camera["cam_K"], (3, 3), f"{path}: image {key} 'cam_K'")
+    lens = read_distortion(camera, path)
     return Observation(
-        raw * (scale * _MILLIMETRE),
-        _labels(scene / "mask_visib", stem, raw.shape),
-        _files.matrix(camera["cam_K"], (3, 3), f"{path}: image {key} 'cam_K'"),
+        undistort(raw * (scale * _MILLIMETRE), lens, intrinsics),
+        undistort(_labels(scene / "mask_visib", stem, raw.shape), lens, intrinsics),
+        intrinsics,
         _pose(camera, f"{path}: image {key}"),
-        None if color is None else _files.read_color_image(color),
+        undistort(None if color is None else _files.read_color_image(color), lens, intrinsics),
     )
 
 

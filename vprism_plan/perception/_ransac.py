@@ -88,21 +88,41 @@ def describe(
     return PlaneCandidate(plane, inliers, float(below.sum()) / count, rms)
 
 
+def concentration(
+    plane: Plane, points: Float[np.ndarray, "n 3"], band: Float[np.ndarray, " n"]
+) -> float:
+    """Share of the points in the band that lie in its middle half.
+
+    0.8 to 1 for the surface of a real table, a half where a plane cuts through others: the
+    floor of a bin and the foot of its wall together, in a band wider than the noise.
+    """
+    height = np.abs(plane.signed_distance(points)) / band
+    return float((height < 0.5).sum()) / max(1, int((height < 1.0).sum()))
+
+
 def find_plane(
     points: Float[np.ndarray, "n 3"],
     band: Float[np.ndarray, " n"],
     rng: np.random.Generator,
+    up: Float[np.ndarray, " 3"] | None = None,
+    max_tilt: float = 180.0,
     hypotheses: int = 768,
 ) -> PlaneCandidate | None:
     """Return the plane with most points in its band, or None if no triple spans one.
 
     Two thirds of the hypotheses take their three points from one neighbourhood: on a
     cluttered scene three random points rarely share a surface, three neighbours mostly
-    do. The best few are refined on all points before the best is chosen.
+    do. The best few are refined on all points before the best is chosen. With `up`, only
+    planes count whose normal is within `max_tilt` degrees of it.
     """
+    least = -2.0 if up is None else float(np.cos(np.radians(max_tilt)))
+    up = np.zeros(3) if up is None else up
     subset = rng.choice(len(points), size=min(len(points), _SCORING_POINTS), replace=False)
     scored, scored_band = points[subset], band[subset]
     normals, offsets = _hypotheses(scored, rng, hypotheses)
+    towards_camera = np.where(offsets > 0, -1.0, 1.0)
+    level = towards_camera * (normals @ up) >= least
+    normals, offsets = normals[level], offsets[level]
     if len(normals) == 0:
         return None
     counts = np.empty(len(normals), dtype=np.int64)
@@ -113,6 +133,8 @@ def find_plane(
     best: PlaneCandidate | None = None
     for index in np.argsort(-counts, kind="stable")[:_REFINED]:
         plane = refine(facing(normals[index], float(offsets[index])), points, band)
+        if plane.normal @ up < least:
+            continue
         candidate = describe(plane, points, band)
         if best is None or candidate.inliers.sum() > best.inliers.sum():
             best = candidate

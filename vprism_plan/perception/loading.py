@@ -14,6 +14,7 @@ from vprism_plan._files import reading
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import _files
 from vprism_plan.perception._bop import load_bop
+from vprism_plan.perception._distortion import read_distortion, undistort
 from vprism_plan.perception.observation import DEFAULT_MAX_RANGE, Observation
 from vprism_plan.perception.plane import Plane
 
@@ -44,6 +45,7 @@ def load_observation(path: str | Path, *, frame: int | None = None) -> Observati
     - a folder: `depth.png` (16-bit), `camera.json` with `fx fy cx cy` (pixels) and
       `depth_scale` (metres per raw unit), optional `T_world_camera` (4x4), `plane`,
       `robot_spheres` and `max_range`; optional `labels.png` and `color.png`.
+      A lens's `distortion` (OpenCV's k1 k2 p1 p2 k3, or 8 numbers) is undone by nearest pixel.
     - a BOP scene folder (`scene_camera.json`, `depth/`, millimetres): `frame` picks the
       image, default the first; labels are the ground-truth index + 1 from
       `mask_visib/`, the pose comes from `cam_R_w2c`, `cam_t_w2c` where present.
@@ -163,12 +165,13 @@ def _assemble(depth: Path, camera: Path, labels: Path, color: Path) -> Observati
     pose = content.get("T_world_camera")
     if pose is not None:
         pose = _files.matrix(pose, (4, 4), f"{camera}: 'T_world_camera'")
+    lens = read_distortion(content, camera)
     return Observation(
-        raw * np.float64(scale),
-        _files.read_label_image(labels) if labels.is_file() else None,
+        undistort(raw * np.float64(scale), lens, intrinsics),
+        undistort(_files.read_label_image(labels), lens, intrinsics) if labels.is_file() else None,
         intrinsics,
         pose,
-        _files.read_color_image(color) if color.is_file() else None,
+        undistort(_files.read_color_image(color), lens, intrinsics) if color.is_file() else None,
         _plane(content.get("plane"), f"{camera}: 'plane'"),
         content.get("robot_spheres"),
         max_range=_files.positive_number(content, "max_range", camera, default=DEFAULT_MAX_RANGE),

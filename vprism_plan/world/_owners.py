@@ -36,7 +36,8 @@ class Owners:
     ) -> None:
         self.first, self.row, self.voxels = verdicts.first, verdicts.row, verdicts.voxels
         self._map, self._n_worlds, self._resolution = map_, n_worlds, resolution
-        self._draws = Draws(map_, n_worlds, seed)
+        self._seed = seed
+        self._draws: Draws | None = None
         n_objects = len(map_.object_ids)
         self.table = np.empty((n_objects + len(self.voxels), n_worlds), np.uint8)
         self.table[:n_objects] = np.arange(1, n_objects + 1, dtype=np.uint8)[:, None]
@@ -50,7 +51,7 @@ class Owners:
     def redrawn(self, seed: int) -> "Owners":
         """Return the owners in as many other draws, none of them drawn yet."""
         other = copy.copy(self)
-        other._draws = Draws(self._map, self._n_worlds, seed)
+        other._seed, other._draws = seed, None
         other.table = self.table.copy()
         other._drawn = np.diff(self._block_start) == 0
         return other
@@ -88,6 +89,12 @@ class Owners:
             near[tuple(slice(a, b) for a, b in zip(*corners, strict=True))] = True
         return np.flatnonzero(near).astype(np.int64)
 
+    def sample(self) -> Draws:
+        """Return the draws of the weights, made when first asked for: seconds for a large map."""
+        if self._draws is None:
+            self._draws = Draws(self._map, self._n_worlds, self._seed)
+        return self._draws
+
     def draw(self, blocks: Int[np.ndarray, " b"]) -> None:
         """Fill the rows of all voxels of some blocks."""
         first_row = len(self._map.object_ids)
@@ -96,6 +103,6 @@ class Owners:
             members = self._by_block[piece]
             points = self._resolution * (self.voxels[members] + self.first)
             found = np.empty((len(members), self._n_worlds), np.uint8)
-            self._draws.owners(points, found)
+            self.sample().owners(points, found)
             self.table[first_row + members] = found
             self._drawn[block] = True

@@ -23,6 +23,8 @@ _CURVATURE_SAFETY = 2.0
 # Log-odds: covers the jump where a kernel is cut off, and rounding.
 _SLACK = 1e-3
 _CHUNK = 1 << 16
+# Cells of a surface, a kilobyte each: about 3 square metres at a resolution of 1 mm.
+_MOST_CELLS = 8_000_000
 
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(27, 3)
 _CHILDREN = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
@@ -147,7 +149,8 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         level: probability.
 
     Raises:
-        WorldError: the map says "occupied" where it has no evidence at all.
+        WorldError: the map says "occupied" where it has no evidence at all, or the cells would
+            fill the memory.
     """
     if map_.unsupported_occupancy >= level:
         raise WorldError(
@@ -166,6 +169,13 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     inner: list[Cells] = []
     evaluations = 0
     while True:
+        # Once cells resolve a surface, halves of them are four times as many.
+        expected = len(index) * (size // 4) ** 2
+        if size * spacing < 0.25 * map_.kernel_length and expected > _MOST_CELLS:
+            raise WorldError(
+                f"the surfaces at level {level:g} would take {expected:,} cells of "
+                f"{4 * spacing:g} m (at most {_MOST_CELLS:,}); use a coarser resolution"
+            )
         size //= 2
         nodes, where = _unique_nodes(index[:, None, :] + _OFFSETS * size)
         values, labels = _evaluate(map_, nodes * spacing, level)

@@ -149,6 +149,13 @@ class PosteriorWorlds:
         )
         return other
 
+    def sample(self) -> None:
+        """Draw the weights and bake a first block now, seconds that the first question saves."""
+        with self._lock:
+            self._owners.sample()
+        needed = np.argwhere(self._grown == kernels.UNBAKED)
+        self._bake(0, needed[:1] // _B)
+
     # --- what is where ---------------------------------------------------------------
     def owners(self, index: Int[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n s"]:
         """Return which object occupies each voxel in each draw.

@@ -106,6 +106,7 @@ class World:
             *(f"known:{k.name}" for k in solids),
         )
         self.plane_names, self.planes = self._half_spaces()
+        choose_grid(map, self.config, None)  # tracing for a grid too large even so takes minutes
         self._factor = lattice_refinement(self.config.resolution, map.kernel_length)
         fine = self.config.resolution / self._factor
         self._level_set = self._timed("level set", trace_level_set, map, fine, self.config.level)
