@@ -35,6 +35,7 @@ def run_plan(command: Plan, console: Console) -> int:
     from vprism_plan.robots import Robot
 
     robot = Robot.from_urdf(command.robot)  # before the long work: the file may be wrong
+    console.warn(robot.warnings)
     _check_lengths(command, robot)
     config = checks(command, robot)
     m = _map_from(command.input, command.frame, command.seed, console)

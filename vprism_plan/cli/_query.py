@@ -22,6 +22,7 @@ def run_query(command: Query, console: Console) -> int:
     from vprism_plan.robots import Robot
 
     robot = Robot.from_urdf(command.robot)
+    console.warn(robot.warnings)
     q = robot.check_configuration(command.q)
     config = checks(command, robot)
     with console.stage("load"):

@@ -16,6 +16,8 @@ from vprism_plan.robots._spheres import link_triangles
 
 # A prism of so many sides is a cylinder to within a ten-thousandth of its radius.
 _SIDES = 256
+_QUICK = 400  # samples of a link's surface, and its corners
+_BARE = 0.001  # metres by which a link must stand out of its spheres to be named
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,38 @@ def robot_report(robot: Any) -> RobotReport:
         len(robot.collision_pairs),
         tuple((pair[0], pair[-2], pair[-1]) for pair in pairs),
     )
+
+
+def robot_warnings(robot: Any) -> tuple[str, ...]:
+    """See :attr:`Robot.warnings`. Samples, no proof: that takes a second (`Robot.report`)."""
+    bare, unread, unchecked = [], [], []
+    for name in dict.fromkeys((*robot.geometry_as_read, *robot.meshes_as_read)):
+        solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
+        rows = robot.link_spheres.get(name, np.empty((0, 4)))
+        if len(rows) == 0:
+            unchecked.append(name)
+        elif any(mesh.path is None for mesh in meshes):
+            unread.append(name)
+        elif robot.sphere_sources.get(name) not in {"fitted", "tiled"}:  # those hold their link
+            surface = link_triangles(solids, meshes, _SIDES)
+            points = surface_samples(surface, _QUICK) if len(surface) else np.empty((0, 3))
+            stands_out = float(sphere_gap(points, rows).max(initial=0.0))
+            if stands_out > _BARE:
+                bare.append(f"{name} by {1000.0 * stands_out:.0f} mm")
+    found = []
+    if bare:
+        found.append(
+            f"collision spheres do not hold their links: {', '.join(bare)} stand out and are not "
+            'checked; fit spheres (spheres="fit"), or enlarge them'
+        )
+    if unread:
+        found.append(
+            f"whether spheres hold {', '.join(unread)} is not known: their meshes were not found; "
+            "give package_dirs"
+        )
+    if unchecked:
+        found.append(f"links without spheres are not checked: {', '.join(unchecked)}")
+    return tuple(found)
 
 
 def _link_report(robot: Any, name: str) -> LinkReport:

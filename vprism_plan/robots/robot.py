@@ -36,7 +36,7 @@ from vprism_plan.robots._sphere_files import write_spheres
 from vprism_plan.robots._sphere_fit import SphereFit
 from vprism_plan.robots._torch_kinematics import TorchKinematics
 from vprism_plan.robots._values import joint_values
-from vprism_plan.robots.report import RobotReport, robot_report
+from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
 
 if TYPE_CHECKING:
     import torch
@@ -349,6 +349,12 @@ class Robot:
             }
             raise RobotError(f"joint values are not finite: {bad}; give finite numbers")
         return array
+
+    @functools.cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What is usable but odd: links that stand out of the spheres that a file gives them, by
+        samples of their surface, and links that nothing checks; with the remedy."""
+        return robot_warnings(self)
 
     def with_base_pose(self, base_pose: ArrayLike) -> Robot:
         """The same robot standing elsewhere; shares everything but the base.
