@@ -255,5 +255,7 @@ def test_the_second_opinion_takes_the_meshes_themselves(tmp_path):
     np.testing.assert_allclose(
         np.ptp(solid.vertices, axis=0), np.ptp(in_link(wedge().vertices), axis=0), atol=1e-6
     )
-    padded = robot_solids(robot.with_padding(0.01), "geometry", None)
-    assert {solid.shape.kind for solid in padded} == {"sphere"}
+    # Padding is a distance to keep, and takes no mesh away.
+    (padded,) = robot_solids(robot.with_padding(0.01), "geometry", None)
+    assert padded.shape.kind == "mesh"
+    assert padded.padding == 0.01
