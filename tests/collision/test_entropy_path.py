@@ -93,7 +93,7 @@ def test_waypoints_average_over_the_spheres_volume(checker):
             continue
         exact = m.entropy(q + ball)[supported].mean()
         assert found.waypoint_mean[t] == pytest.approx(exact, abs=0.05)
-        assert found.waypoint_max[t] == found.waypoint_mean[t]  # one sphere only
+        assert found.waypoint_max[t] == pytest.approx(found.waypoint_mean[t], rel=1e-12)
     assert np.isfinite(found.waypoint_mean).any()
 
 

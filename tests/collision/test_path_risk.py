@@ -603,10 +603,10 @@ def bounded(strict_world, ball_robot):
 
 
 def on_level_set(checker, places, room=0.0):
-    """Where a ball touches what verdicts go by if the bound is below the level."""
-    if checker.config.max_risk >= checker.world.config.level:
-        return np.zeros(len(places), bool)
-    field = checker.world.certain_field(level_set=True)
+    """Where a ball touches what verdicts go by beside the draws: the level set, or, if the bound
+    is above the level, what was seen."""
+    below = checker.config.max_risk < checker.world.config.level
+    field = checker.world.certain_field(level_set=below, seen=not below)
     return field.lower_bound(np.ascontiguousarray(places)) <= RADIUS + room
 
 

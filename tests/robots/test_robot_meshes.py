@@ -258,4 +258,3 @@ def test_the_second_opinion_takes_the_meshes_themselves(tmp_path):
     # Padding is a distance to keep, and takes no mesh away.
     (padded,) = robot_solids(robot.with_padding(0.01), "geometry", None)
     assert padded.shape.kind == "mesh"
-    assert padded.padding == 0.01

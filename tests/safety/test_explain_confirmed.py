@@ -8,7 +8,9 @@ from oracles.checker_oracle import sphere_positions
 from scipy.spatial import cKDTree
 
 import vprism_plan as vp
+from vprism_plan.perception.camera import pixel_rays
 from vprism_plan.world.known import Box, Cylinder, HalfSpace
+from vprism_plan.world.lost_depth import lost_cones
 
 VOXEL = 0.01
 FINE = 0.004  # of the oracle's own lattices
@@ -53,9 +55,18 @@ class Oracle:
         }
 
     def labelled(self, object_id: int) -> np.ndarray:
-        """Points that a camera saw of an object: obstacles wherever the level set misses them."""
-        seen = [view.points() for view in self.map.views]
-        return np.concatenate([points[labels == object_id] for points, labels in seen])
+        """Points that a camera saw of an object, and the cones of its pixels without depth:
+        obstacles wherever the level set misses them."""
+        found = []
+        for view in self.map.views:
+            points, labels = view.points()
+            found.append(points[labels == object_id])
+            rays = pixel_rays(view.shape, view.intrinsics) @ view.pose[:3, :3].T
+            for lost_id, start, end in lost_cones(view, self.map.plane):
+                for v, u in np.argwhere((start < end) & (lost_id == object_id)):
+                    depths = np.arange(start[v, u], min(end[v, u], 3.0) + FINE, FINE)
+                    found.append(view.camera_center + depths[:, None] * rays[v, u])
+        return np.concatenate(found)
 
     @cached_property
     def clutter(self) -> cKDTree:

@@ -21,6 +21,7 @@ _MAX_NODES = 60_000_000
 # that works on them reaches.
 _FAR_SPACING = 0.1  # metres
 _FAR_REACH = 4.4  # metres beyond the grid
+_FAR_BELOW = 0.5  # metres below it: its end must not count where the support surface does
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ def grid_beyond(inner: Grid, plane: Plane | None, bounded: bool) -> Grid:
     """
     lower, upper = inner.origin - _FAR_REACH, inner.upper + _FAR_REACH
     if is_level(plane):
-        lower[2] = inner.origin[2] - (_FAR_REACH if bounded else 0.0)
+        lower[2] = inner.origin[2] - (_FAR_REACH if bounded else _FAR_BELOW)
     spacing = max(_FAR_SPACING, 2.0 * inner.spacing)
     first = np.floor(lower / spacing).astype(np.int64)
     x, y, z = (int(n) for n in np.ceil(upper / spacing).astype(np.int64) - first + 1)

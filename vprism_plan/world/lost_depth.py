@@ -18,7 +18,8 @@ from vprism_plan.perception.camera import pixel_rays
 _TALLEST = 0.4  # metres above the support surface; what stands on a table is rarely taller
 _OVERHANG = (0.03, 0.15)  # metres by which a thing may lean out over its foot, least and most
 _SLOPE = 2.0  # metres nearer per metre to the side: how steeply a seen surface may go on
-_NEAR = 0.01  # metres a surface may bulge beside what was seen of it
+_NEAR = 0.002  # metres a surface may bulge beside what was seen of it
+_HOLE = 5  # pixels; smaller holes in what was seen of an object are no news
 _BESIDE = 3  # pixels around a mask that count as beside it
 _PIECE = 200_000  # points at a time
 
@@ -41,7 +42,8 @@ def lost_cones(
     the upright plane through the front of its foot, of its other points and of what is seen
     beside its mask, moved towards the camera by half its width; the height of 40 cm; and its
     own nearest seen surface, continued towards the camera at two metres per metre. Farthest is
-    that surface continued away from the camera. Other pixels have no cone: inf, -inf.
+    that surface continued away from the camera. Other pixels have no cone: inf, -inf; nor have
+    holes of up to four pixels, as noise leaves them in what was seen.
     """
     lost_ids = lost_objects(view)
     if not lost_ids:
@@ -56,6 +58,7 @@ def lost_cones(
     for object_id in lost_ids:
         mask = view.labels == object_id
         lost = mask & (view.depth == 0)
+        lost &= ~ndimage.binary_closing(mask & ~lost, np.ones((_HOLE, _HOLE), dtype=bool))
         start, end = _beside_own_surface(view, mask)
         if plane is not None:
             foot = _before_foot(view, plane, mask, lost, rays, points, at_plane)
