@@ -18,6 +18,7 @@ FINE = 0.004  # of the oracle's own lattices
 # bounds between nodes, the diagonal of the cells (half a voxel) that obstacles are made of,
 # and what the oracle's lattice leaves out. See `DistanceField` and `World`.
 INFLATION = 0.75 * VOXEL + np.sqrt(3.0) * (0.5 * VOXEL + 0.5 * FINE)
+COARSE = 2.0 * np.sqrt(3.0) * 0.1  # the same beyond the grid: nodes 10 cm apart
 PIXEL = 0.002  # half the width of a pixel at the far end of the scene, metres
 
 
@@ -83,7 +84,8 @@ class Oracle:
             points = center + cube[np.linalg.norm(cube, axis=1) <= radius]
             status = self.world.status(points)
             if kind == "unobserved":
-                hits = status >= 2
+                grid = self.world.grid  # where the policy is "occupied", all outside of it is
+                hits = (status >= 2) | ((points < grid.origin) | (points > grid.upper)).any(axis=1)
             else:  # what lies under the support surface is that surface's
                 hits = (status == 1) & (self.map.plane.signed_distance(points) > 0.0)
             if hits.any():
@@ -92,7 +94,11 @@ class Oracle:
 
     def reaches(self, contact, center: np.ndarray, radius: float) -> bool:
         """Whether the ball comes as near to the named obstacle as its field claims."""
-        reach = radius + INFLATION
+        grid = self.world.grid
+        coarse = ((center < grid.origin) | (center > grid.upper)).any()
+        reach = radius + (COARSE if coarse else INFLATION)
+        if coarse and self.map.plane.signed_distance(center) < 0.0:
+            return True  # under the table, whose coarse cells reach to both sides of it
         kind, _, name = contact.body.partition(":")
         if kind == "object":
             return bool(self.level_set[int(name)].query(center)[0] <= reach + PIXEL)
@@ -221,5 +227,5 @@ def test_reasons_of_a_ball_near_clutter_are_confirmed(demo_map, demo_world, orac
         towards = (eye - at) / np.linalg.norm(eye - at, axis=1, keepdims=True)
         return at + rng.uniform(0.0, 0.03, (n, 1)) * towards + rng.normal(0.0, 0.003, (n, 3))
 
-    kinds = examine(checker, oracle, refused(checker, sample, 200))
+    kinds = examine(checker, oracle, refused(checker, sample, 500))
     assert kinds.get("background", 0) > 20, kinds
