@@ -155,7 +155,7 @@ def test_nothing_to_pay_means_free(cost_world, ball, arm):
             centers, plane, _, field = checker.sphere_clearances(q)
             wrong = moving & (np.minimum(plane, field) <= 0.0)
             assert ((centers < grid.origin) | (centers > grid.upper)).any(axis=1)[wrong].all()
-        assert (cost.numpy()[clearance < 0.0] > 0.0).mean() > 0.9
+        assert (cost.numpy()[clearance < 0.0] > 0.0).mean() > 0.95
         assert 0.02 < (cost == 0.0).double().mean() < 0.98
 
 
