@@ -72,11 +72,6 @@ def test_far_depth_of_a_view_is_kept(small_map, saved, tmp_path):
     (new,) = load_map(tmp_path / "again.safetensors").views
     assert new.max_range == 20.0
     np.testing.assert_array_equal(new.depth, far)
-    # A file from before the limit knows none: the map was learned from all that it holds.
-    old = rewrite(
-        saved, tmp_path / "old.safetensors", {"max_range": [None]}, **{"view0.depth": far}
-    )
-    np.testing.assert_array_equal(load_map(old).views[0].depth, far)
     with pytest.raises(MapError, match="damaged"):
         load_map(rewrite(saved, tmp_path / "bad.safetensors", {"max_range": [10.0, 10.0]}))
 
