@@ -221,7 +221,7 @@ def _views(
     stray = sorted(set(tensors) - names)
     if stray:
         raise MapError(f"{', '.join(stray)} belong to none of its {count} views")
-    return tuple(_view(tensors, i, most) for i, most in zip(range(count), ranges, strict=True))
+    return tuple(_view(tensors, i, ranges[min(i, len(ranges) - 1)]) for i in range(count))
 
 
 def _check_labels(views: tuple[Observation, ...], object_ids: tuple[int, ...]) -> None:
