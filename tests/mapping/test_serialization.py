@@ -177,7 +177,7 @@ def test_any_flipped_bit_is_noticed_or_without_effect(saved, small_map, tmp_path
 CRAFTED = {
     "no views": ({"views": 0}, {}, "learned from one"),
     "fewer views": ({"views": 10**12}, {}, "learned from one"),
-    "a view too many": ({"views": 2}, {}, "view 1 has no depth"),
+    "a view too many": ({"views": 2, "max_range": [10.0, 10.0]}, {}, "view 1 has no depth"),
     "a stray tensor": ({}, {"view7.depth": np.ones((2, 2))}, r"view7\.depth belong to none"),
     "ids in no order": ({"object_ids": [2, 1]}, {}, "positive and rise"),
     "an id of 0": ({"object_ids": [0, 1]}, {}, "positive and rise"),

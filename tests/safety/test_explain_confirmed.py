@@ -97,9 +97,9 @@ class Oracle:
         grid = self.world.grid
         coarse = ((center < grid.origin) | (center > grid.upper)).any()
         reach = radius + (COARSE if coarse else INFLATION)
+        kind, _, name = contact.body.partition(":")
         if kind == "occluded" and self.map.plane.signed_distance(center) < 0.0:
             return True  # coarse cells reach to both sides of the table, where it answers anyway
-        kind, _, name = contact.body.partition(":")
         if kind == "object":
             return bool(self.level_set[int(name)].query(center)[0] <= reach + PIXEL)
         if kind == "background":

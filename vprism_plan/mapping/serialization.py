@@ -209,19 +209,19 @@ def _check_posterior(space: FeatureSpace, posterior: Posterior, classes: int) ->
         raise MapError("history is no row of finite numbers")
 
 
-def _views(
-    tensors: Mapping[str, np.ndarray], count: Any, ranges: list[float]
-) -> tuple[Observation, ...]:
+def _views(tensors: Mapping[str, np.ndarray], count: Any, ranges: Any) -> tuple[Observation, ...]:
     """Return all views; there is one at least, and no tensor belongs to nothing."""
     if not (is_whole(count) and 0 < count <= len(tensors)):
         raise MapError(f"views is {count!r}; a map is learned from one at least")
+    if not (isinstance(ranges, list) and len(ranges) == count):
+        raise MapError(f"max_range is {ranges!r}; it must be a list of one length per view")
     names = {"hinges", "mean", "covariance", "precision", "log_determinant", "history", "plane"}
     for index in range(count):
         names.update(f"view{index}.{part}" for part in (*_VIEW_PARTS, "plane"))
     stray = sorted(set(tensors) - names)
     if stray:
         raise MapError(f"{', '.join(stray)} belong to none of its {count} views")
-    return tuple(_view(tensors, i, ranges[min(i, len(ranges) - 1)]) for i in range(count))
+    return tuple(_view(tensors, i, ranges[i]) for i in range(count))
 
 
 def _check_labels(views: tuple[Observation, ...], object_ids: tuple[int, ...]) -> None:

@@ -15,6 +15,7 @@ from vprism_plan.world.distance import (
     finish,
 )
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
+from vprism_plan.world.unseen import unmark
 from vprism_plan.world.world import SUPPORT, World
 
 
@@ -29,8 +30,8 @@ def source_field(world: World, name: str, without: Collection[int] = ()) -> Dist
     Args:
         world: the world.
         name: one of `world.sources`.
-        without: objects whose part of the occluded space is left out, as
-            `World.fields_without` does.
+        without: objects whose part of the occluded space, and of cells they share with this
+            obstacle, is left out, as `World.fields_without` does; nothing is, of their own.
 
     Returns:
         The field; its `source` is -1 everywhere if there is no such obstacle.
@@ -40,7 +41,9 @@ def source_field(world: World, name: str, without: Collection[int] = ()) -> Dist
     """
     if name not in world.sources:
         raise WorldError(f"no source {name!r} in this world; it has {', '.join(world.sources)}")
-    gone = frozenset(world._classes(without)) if name == "occluded" else frozenset[int]()
+    gone = frozenset(world._classes(without))
+    if name.startswith(("known:", SUPPORT)) or name in {f"object:{i}" for i in without}:
+        gone = frozenset()
     key = (name, gone)
     if key not in world._cache:
         world._cache[key] = _bake(world, name, gone)
@@ -60,8 +63,8 @@ def _bake(world: World, name: str, gone: frozenset[int]) -> DistanceField:
         nodes = combine(world._known_distances(solids), world.grid)
     elif name == SUPPORT:
         nodes = combine(world._support_distances(world.grid), world.grid)
-        far = combine(world._support_distances(world._grid_beyond), world._grid_beyond)
-        beyond = finish(far, world._grid_beyond, world.sources, False)
+        rim = combine(world._support_distances(world._grid_beyond), world._grid_beyond)
+        beyond = finish(rim, world._grid_beyond, world.sources, False)
     else:
         marks = world._without(world._unseen, gone) if gone else world._unseen
         mark = int(np.flatnonzero(world._sources_of_marks() == index)[0])
@@ -70,7 +73,8 @@ def _bake(world: World, name: str, gone: frozenset[int]) -> DistanceField:
         if index < len(world.map.object_ids):
             parts.append(world._object_distances([index + 1]))
         if world._marks_beyond is not None:
-            beyond, inside = world._around(_only(world._marks_beyond, mark), False)
+            far = unmark(world._marks_beyond, gone, None)
+            beyond, inside = world._around(_only(far, mark), False)
             parts += inside
         nodes = combine(parts, world.grid)
     distance = nodes.distance

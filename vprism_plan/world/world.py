@@ -285,10 +285,13 @@ class World:
                 parts.append(self._solid_distances(item, name, self.grid))
         return parts
 
-    def _field(self, parts: list[NodeDistances]) -> DistanceField:
-        nodes = combine([*parts, *self._from_beyond], self.grid)
+    def _field(self, parts: list[NodeDistances], without: Collection[int] = ()) -> DistanceField:
+        beyond, inside = self._beyond, self._from_beyond
+        if without and self._marks_beyond is not None:
+            beyond, inside = self._around(unmark(self._marks_beyond, without, None), True)
+        nodes = combine([*parts, *inside], self.grid)
         outside = self.config.unobserved == "occupied"
-        return finish(nodes, self.grid, self.sources, outside, self._beyond)
+        return finish(nodes, self.grid, self.sources, outside, beyond)
 
     # --- queries ---------------------------------------------------------------
 
@@ -324,7 +327,7 @@ class World:
             rest = set(range(1, len(self.map.object_ids) + 1)) - gone
             kept = self._object_distances(rest)
             unseen = self._unseen_distances(self._without(self._unseen, gone))
-            self._cache[key] = self._field([kept, unseen, self._known])
+            self._cache[key] = self._field([kept, unseen, self._known], gone)
         return self._cache[key]
 
     def certain_field(
@@ -355,7 +358,7 @@ class World:
             if level_set:
                 rest = set(range(1, len(self.map.object_ids) + 1)) - gone
                 parts.append(self._object_distances(rest))
-            self._cache[key] = self._field(parts)
+            self._cache[key] = self._field(parts, gone)
         return self._cache[key]
 
     def posterior_worlds(
