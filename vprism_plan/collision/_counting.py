@@ -62,6 +62,15 @@ def count_each(at: Setting, Q: Float[np.ndarray, "n dof"]) -> Sweep:
     return Sweep(centers, slack, waypoints, *_touch(at, centers, slack))
 
 
+def recount(at: Setting, sweep: Sweep, within: bool = False) -> Sweep:
+    """Count again at a sweep's samples, for spheres of other radii.
+
+    With `within`, the samples alone, not the way between them.
+    """
+    slack = np.zeros_like(sweep.slack) if within else sweep.slack
+    return Sweep(sweep.centers, slack, sweep.waypoints, *_touch(at, sweep.centers, slack))
+
+
 def count_at(at: Setting, q: Float[np.ndarray, "dof"]) -> tuple[Float[np.ndarray, "3 s"], int]:
     """Sphere centres at a configuration, and how many worlds they touch: the quick way."""
     worlds = at.worlds

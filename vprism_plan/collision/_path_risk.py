@@ -2,7 +2,7 @@
 """Counts the posterior worlds in which a robot collides."""
 
 import copy
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,18 +10,20 @@ from jaxtyping import Float, Int
 
 from vprism_plan._kernels import checking
 from vprism_plan.collision._causes import first_contacts, risky_contacts
-from vprism_plan.collision._counting import count_at, count_each, count_path
-from vprism_plan.collision._risk_setting import PADDINGS, Setting, make_setting, with_margin
+from vprism_plan.collision._counting import Sweep, count_at, count_each, count_path, recount
+from vprism_plan.collision._risk_setting import (
+    CORNER,
+    PADDINGS,
+    Setting,
+    grown,
+    make_setting,
+    with_margin,
+)
 from vprism_plan.collision._unsupported import SpaceCodes
 from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.protocols import NodeField, RuledWorld, SphereRobot
 from vprism_plan.collision.reports import Contact
-from vprism_plan.collision.risk import (
-    FirstContact,
-    RiskEstimate,
-    clopper_pearson,
-    tolerated_hits,
-)
+from vprism_plan.collision.risk import RiskEstimate, clopper_pearson, tolerated_hits
 
 _HELD_OUT = 1_000_003  # added to the seed of the draws
 
@@ -41,9 +43,10 @@ class PathRisk:
         rules: Sequence[Collection[int]],
         link_rules: Int[np.ndarray, " l"],
     ) -> None:
-        # Probabilities are of touching; verdicts keep the margin as well.
+        # Probabilities are of touching; verdicts keep the margin as well, and touch a voxel
+        # at its corners.
         self._at = make_setting(world, robot, config, rules, link_rules)
-        self._kept = with_margin(self._at, config.margin)
+        self._kept = grown(with_margin(self._at, config.margin), CORNER)
         worlds = self._at.worlds
         lower, upper = clopper_pearson(config.n_worlds, config.confidence)
         self._lower = np.maximum(lower - worlds.error_occupied, 0.0)
@@ -85,8 +88,7 @@ class PathRisk:
         if level > halvings:
             if level - halvings > len(PADDINGS):
                 return None
-            grown = PADDINGS[level - halvings - 1] * self._at.worlds.resolution
-            stricter._kept = replace(self._kept, radii=self._kept.radii + grown)
+            stricter._kept = grown(self._kept, PADDINGS[level - halvings - 1])
         return stricter
 
     def held_out(self) -> "PathRisk":
@@ -124,62 +126,41 @@ class PathRisk:
         return risky_contacts(self._kept, sweep, float(self._upper[int(sweep.touched.sum())]))
 
     # --- estimates ---------------------------------------------------------------------
-    def estimate_at(self, q: Float[np.ndarray, "dof"]) -> RiskEstimate:
-        """Return the probability of collision at a configuration."""
-        at = self._at
-        centers, hits = count_at(at, q)
-        edge = -1 if checking.is_valid(q, at.floats, at.ints, *at.packed) else 0
-        per_waypoint = np.array([1.0 if edge >= 0 else hits / at.worlds.n_worlds])
-
-        def trace() -> tuple[FirstContact, ...]:
-            path = q[None].copy()
-            return first_contacts(at, path, count_path(at, path), edge, 0.0)
-
-        return self._result(at, hits, edge, per_waypoint, centers[None], trace)
-
     def estimate(self, path: Float[np.ndarray, "t dof"], with_margin: bool = False) -> RiskEstimate:
         """Return the joint probability of collision along a path, or of coming within the
-        margin."""
-        at = self._kept if with_margin else self._at
-        sweep = count_path(at, path)
+        margin; of a configuration, where the path has one row."""
+        at = grown(self._kept, -CORNER) if with_margin else self._at
+        path = path.copy()
+        n, inside = at.worlds.n_worlds, 0
+        around = sweep = count_path(grown(at, CORNER), path)
+        if around.touched.any():
+            sweep = recount(at, around)
+            # A draw that occupies the centre of a voxel occupies that point, whatever voxels are.
+            inside = int(recount(grown(at, -0.5), around, within=True).touched.sum())
         clear = np.empty(len(path), np.bool_)
         checking.is_valid_batch(path, at.floats, at.ints, *at.packed, clear)
         stats = np.zeros(4)
-        edge = checking.check_path(
-            path, at.floats, at.ints, *at.packed, at.config.min_motion, stats
-        )
-        per_waypoint = sweep.counts[sweep.waypoints] / at.worlds.n_worlds
+        edge = -1 if clear.all() else 0
+        if len(path) > 1:
+            edge = checking.check_path(
+                path, at.floats, at.ints, *at.packed, at.config.min_motion, stats
+            )
+        certain = edge >= 0
+        per_waypoint = sweep.counts[sweep.waypoints] / n
         per_waypoint[~clear] = 1.0
-        kept, fraction = path.copy(), float(stats[0])
-
-        def trace() -> tuple[FirstContact, ...]:
-            return first_contacts(at, kept, sweep, edge, fraction)
-
-        return self._result(at, int(sweep.touched.sum()), edge, per_waypoint, sweep.centers, trace)
-
-    def _result(
-        self,
-        at: Setting,
-        hits: int,
-        edge: int,
-        per_waypoint: Float[np.ndarray, " t"],
-        centers: Float[np.ndarray, "n 3 s"],
-        trace: Callable[[], tuple[FirstContact, ...]],
-    ) -> RiskEstimate:
-        n = at.worlds.n_worlds
         return RiskEstimate(
-            probability=1.0 if edge >= 0 else hits / n,
-            lower=1.0 if edge >= 0 else float(self._lower[hits]),
-            upper=1.0 if edge >= 0 else float(self._upper[hits]),
+            probability=1.0 if certain else float(sweep.touched.sum()) / n,
+            lower=1.0 if certain else float(self._lower[inside]),
+            upper=1.0 if certain else float(self._upper[int(around.touched.sum())]),
             confidence=at.config.confidence,
             n_worlds=n,
             seed=at.worlds.seed,
             per_waypoint=per_waypoint,
-            certain=edge >= 0,
+            certain=certain,
             spacing=at.spacing,
-            configurations=len(centers),
-            trace=trace,
-            volume=lambda: self._shares(at, centers),
+            configurations=len(sweep.centers),
+            trace=lambda: first_contacts(at, path, sweep, edge, float(stats[0])),
+            volume=lambda: self._shares(at, sweep.centers),
         )
 
     def _shares(self, at: Setting, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:

@@ -95,7 +95,7 @@ class Queries:
         risk = self._risk()
         if held_out:
             risk = risk.held_out()
-        return risk.estimate_at(rows[0]) if len(rows) == 1 else risk.estimate(rows)
+        return risk.estimate(rows)
 
     def _ruled_world(self) -> RuledWorld:
         if not isinstance(self.world, RuledWorld):

@@ -15,10 +15,13 @@ from vprism_plan.world import PosteriorWorlds
 
 # Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
 PADDINGS = (0.5, 1.0, 2.0)
+# Voxels between a voxel's faces and its corners: a sphere grown by it touches the ball around
+# every occupied voxel that it meets, where else it touches the ball inside.
+CORNER = 0.5 * 3.0**0.5 - 0.5
 # Voxels between a sphere's surface and the farthest voxel it is compared with: the way to
-# the far node of its centre's cell, half a voxel for a voxel's own size, at most five eighths
-# for the way between samples, and room to spare.
-_ROOM = 3.0
+# the far node of its centre's cell, half a diagonal for a voxel's own size, at most five
+# eighths for the way between samples, and room to spare.
+_ROOM = 3.0 + CORNER
 
 
 class Certain:
@@ -86,6 +89,12 @@ class Setting:
         floats = floats.copy()
         floats[6] += self.margin
         return distance, blocks, floats
+
+
+def grown(setting: Setting, voxels: float) -> Setting:
+    """Return the same for spheres larger by some voxels (smaller, if negative) in the draws."""
+    radii = setting.radii + voxels * setting.worlds.resolution
+    return dataclasses.replace(setting, radii=radii)
 
 
 def with_margin(setting: Setting, margin: float) -> Setting:

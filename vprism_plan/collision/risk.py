@@ -43,11 +43,14 @@ class RiskEstimate:
 
     Attributes:
         probability: share of the worlds in which any sphere touches anything anywhere on
-            the path; the same world for the whole path. 1 if a certain obstacle is hit.
-        lower: Clopper-Pearson bound less what skipping certain voxels may add.
-        upper: Clopper-Pearson bound and what skipping certain voxels may hide; above 0
-            even if no world collides.
-        confidence: of the interval (lower, upper), two-sided.
+            the path; the same world for the whole path. A voxel counts as the ball inside
+            it. 1 if a certain obstacle is hit.
+        lower: Clopper-Pearson bound of the worlds that occupy a voxel's centre inside a
+            sphere, less what skipping certain voxels may add.
+        upper: Clopper-Pearson bound of the worlds with a voxel whose corners a sphere reaches,
+            and what skipping certain voxels may hide; above 0 even if no world collides.
+            Verdicts with `max_risk` go by it.
+        confidence: of the interval (lower, upper), two-sided; it holds the size of voxels.
         n_worlds: worlds drawn.
         seed: of the draws.
         per_waypoint: (T,) the same probability at each waypoint alone.
