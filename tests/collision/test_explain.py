@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracles.checker_oracle import BallWorld, self_clearance, sphere_positions
 from oracles.random_robots import as_robot, random_arrays, random_q
 
-from vprism_plan.collision import CollisionChecker
+from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.collision._explain import unit_ball_points
 
 SPACING = 0.03
@@ -79,3 +79,25 @@ def test_sampling_points_fill_the_unit_ball():
     assert radii.max() == pytest.approx(1.0)
     assert np.all(radii <= 1.0 + 1e-12)
     assert np.linalg.norm(points.mean(axis=0)) < 0.1
+
+
+def test_what_is_only_too_near_is_from_it_and_what_overlaps_is_into_it():
+    """ "2 mm into the support surface" was said of a ball 8 mm above it, with 10 mm asked for."""
+    rng, arrays, truth, _ = make(3, [[0.0, 0.0, 1.0, -0.5]])
+    rule = CheckerConfig(margin=0.05)
+    checker = CollisionChecker(truth.baked(SPACING), as_robot(arrays), rule)
+    said = set()
+    for _ in range(400):
+        q = random_q(rng, arrays)
+        centers = sphere_positions(arrays, q)
+        for contact in checker.explain(q).contacts:
+            if contact.kind != "support":
+                continue
+            assert contact.required == pytest.approx(0.05)
+            gap = centers[contact.sphere, 2] + 0.5 - arrays.sphere_radius[contact.sphere]
+            assert contact.required - contact.depth == pytest.approx(gap, abs=1e-9)
+            word = "from" if gap > 0.0 else "into"
+            assert f"{1000 * abs(gap):.1f} mm {word} the support surface" in contact.text()
+            assert ("50.0 mm asked for" in contact.text()) == (gap > 0.0)
+            said.add(word)
+    assert said == {"from", "into"}

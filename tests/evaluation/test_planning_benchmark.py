@@ -4,6 +4,7 @@
 import dataclasses
 import importlib
 import json
+import pickle
 import sqlite3
 from itertools import combinations
 from types import SimpleNamespace
@@ -165,6 +166,9 @@ def test_fcl_says_what_the_mesh_checker_says(bench):
     refused = Q[verdicts.index(False)]
     assert not checker.explain(refused).valid
     assert checker.explain(refused).contacts
+    copied = pickle.loads(pickle.dumps(checker))
+    assert type(copied) is type(checker)
+    assert [copied.is_valid(q) for q in Q] == verdicts
 
 
 # --- runs -----------------------------------------------------------------------------

@@ -4,6 +4,7 @@
 import json
 import logging
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from types import SimpleNamespace
 
 import disk_world
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from oracles.world_oracles import KernelMap
 
-from vprism_plan.collision import CollisionChecker, MeshChecker
+from vprism_plan.collision import CheckerConfig, CollisionChecker, MeshChecker
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import plan
 from vprism_plan.robots import Robot
@@ -140,3 +141,22 @@ def test_meshes_name_the_link_that_sticks_out_of_its_spheres(around_a_blob):
         assert word in result.message
     json.dumps(asdict(result.report))  # as the command line writes it
     json.dumps(result.report.second_opinion.to_dict())
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.02])
+def test_meshes_plan_by_themselves(around_a_blob, margin):
+    """`plan` takes a `MeshChecker` in the place of a `CollisionChecker`."""
+    spheres = around_a_blob(0.053)
+    rule = CheckerConfig(margin=margin)
+    meshes = MeshChecker(spheres.world, spheres.robot, rule, step=0.01)
+    start, goal = [-0.2, 0.01], [0.2, 0.01]
+    result = plan(meshes, start, goal, time_limit=20.0)
+    assert result.solved, result.message
+    np.testing.assert_allclose(result.path[[0, -1]], [start, goal])
+    assert len(result.path) > 2
+    for qa, qb in pairwise(result.path):
+        for share in np.linspace(0.0, 1.0, 30):
+            assert meshes.clearance(qa + share * (qb - qa)) >= margin - 0.005
+    blocked = plan(meshes, start, [0.0, 0.0])
+    assert blocked.status == "invalid_goal"
+    assert "object:1" in blocked.message

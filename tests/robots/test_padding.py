@@ -7,6 +7,7 @@ import logging
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.kinematics_oracle import random_pose
@@ -19,6 +20,7 @@ from vprism_plan.errors import RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
 from vprism_plan.robots._padding import grown
 from vprism_plan.robots._self_collision import pairs_touching
+from vprism_plan.world import Sphere, World, WorldConfig
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -207,6 +209,34 @@ def test_the_second_opinion_pads_links_against_the_world_alone(demo_world, robot
     for links in ("spheres", "geometry"):
         meshes = MeshChecker(demo_world, padded, links=links)
         assert all(meshes.is_valid(q) for q in accepted)
+
+
+def test_padding_is_a_distance_to_keep_for_meshes(demo_world, tmp_path):
+    """It once took a link's mesh from the second opinion, which then judged its one small ball."""
+    block = trimesh.creation.box((0.2, 0.2, 0.3))
+    block.export(tmp_path / "block.stl")
+    path = tmp_path / "block.urdf"
+    path.write_text(
+        '<robot name="r"><link name="base"/><link name="l"><collision><geometry>'
+        '<mesh filename="block.stl"/></geometry></collision></link><joint name="z" '
+        'type="prismatic"><parent link="base"/><child link="l"/><axis xyz="0 0 1"/>'
+        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    small = {"l": [{"center": [0, 0, 0], "radius": 0.05}]}
+    base = np.eye(4)
+    base[:3, 3] = 0.0, -0.9, 0.0
+    plain = Robot.from_urdf(path, spheres=small, base_pose=base)
+    ball = Sphere("ball", 0.03, (0.09, -0.81, 0.8))
+    world = World(demo_world.map, WorldConfig(known=(ball,), occluded="free", resolution=0.02))
+    for padding in (0.0, 0.005, 0.02):
+        meshes = MeshChecker(world, plain.with_padding(padding))
+        # The block's top is 15 cm above its joint value, the ball's bottom at 0.77 m.
+        assert meshes.is_valid([0.62 - padding - 0.001])
+        assert not meshes.is_valid([0.62 - padding + 0.001])
+        if padding:
+            contact = meshes.explain([0.62 - padding + 0.001]).contacts[0]
+            assert contact.required == pytest.approx(padding)
+            assert f"{1000 * padding - 1:.1f} mm from known:ball" in contact.text()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -60,6 +60,20 @@ MALFORMED = {
         chain(joint("j1", "a", "b", limit='<limit lower="0" upper="1" velocity="-1"/>')),
         "velocity limit -1.0",
     ),
+    "soft limits apart from the hard ones": (
+        chain(
+            joint("j1", "a", "b", extra='<safety_controller soft_lower_limit="5" k_velocity="1"/>')
+        ),
+        r"'j1' .* soft limits \[5, .*leave nothing",
+    ),
+    "soft limits that are no numbers": (
+        chain(
+            joint(
+                "j1", "a", "b", extra='<safety_controller soft_upper_limit="nan" k_velocity="1"/>'
+            )
+        ),
+        "'j1' .*soft limits",
+    ),
     "zero axis": (chain(joint("j1", "a", "b", axis="0 0 0")), "axis .* not all zero"),
     "short axis": (chain(joint("j1", "a", "b", axis="0 1")), "needs three finite numbers"),
     "scaled prismatic axis": (
@@ -110,3 +124,20 @@ def test_what_does_not_matter_is_ignored(write):
     )
     robot = Robot.from_urdf(write(TWO.replace('<link name="a">', noise, 1)))
     assert robot.joint_names == ("j1", "j2")
+
+
+def test_soft_limits_narrow_the_range_as_in_moveit(write):
+    """Of either side, the stricter one; a continuous joint has none."""
+    limit = '<limit lower="-2" upper="2" velocity="1" effort="1"/>'
+    soft = '<safety_controller soft_lower_limit="{}" soft_upper_limit="{}" k_velocity="1"/>'
+    robot = Robot.from_urdf(
+        write(
+            chain(
+                joint("j1", "a", "b", limit=limit, extra=soft.format(-1.5, 3.0)),
+                joint("j2", "b", "c", kind="continuous", extra=soft.format(-0.1, 0.1)),
+            )
+        )
+    )
+    assert robot.lower[0] == -1.5
+    assert robot.upper[0] == 2.0
+    assert robot.upper[1] > 3.0

@@ -111,6 +111,12 @@ def test_a_robot_whose_base_stands_lower_is_not_in_the_table(view, tmp_path):
     assert lower.is_valid([0.1])
     assert not lower.is_valid([FLOOR + 0.3])
     assert vp.CollisionChecker(world, robot(tmp_path, -0.3)).world is lower.world
+    meshes = vp.MeshChecker(world, robot(tmp_path, -0.3))
+    assert meshes.world is lower.world
+    assert meshes.is_valid([0.1])
+    heights = np.linspace(-0.2, 0.5, 30)[:, None]
+    assert (meshes.is_valid_batch(heights) >= lower.is_valid_batch(heights)).all()
+    assert not meshes.is_valid([FLOOR + 0.3])
     fixed = World(world.map, WorldConfig(support="unbounded"))
     assert not vp.CollisionChecker(fixed, robot(tmp_path, -0.3)).is_valid([0.1])
 

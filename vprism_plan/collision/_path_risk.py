@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from vprism_plan._kernels import checking
 from vprism_plan.collision._causes import first_contacts, risky_contacts
-from vprism_plan.collision._counting import Sweep, count_at, count_each, count_path, recount
+from vprism_plan.collision._counting import count_at, count_each, count_path, recount
 from vprism_plan.collision._risk_setting import (
     CORNER,
     PADDINGS,

@@ -9,6 +9,7 @@ saw it takes from the images, so it can contradict the map as well.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -92,7 +93,10 @@ class MeshChecker:
         _fcl.fcl()
         if not (math.isfinite(step) and step >= 1e-5):
             raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
-        self._made_of = world, robot, config, links, link_meshes, resolution, step, seen
+        self._made: partial[MeshChecker] = partial(
+            MeshChecker, world, robot, config, links=links, link_meshes=link_meshes,
+            resolution=resolution, step=step, seen=seen,
+        )  # fmt: skip
         if hasattr(world, "for_base"):
             world = world.for_base(robot.base_pose[:3, 3])
         self.world = world
@@ -108,7 +112,7 @@ class MeshChecker:
 
     def __reduce__(self) -> Any:
         """A copy is made anew: FCL's objects cannot be copied."""
-        return _made, self._made_of
+        return self._made, ()
 
     @classmethod
     def like(cls, checker: Any, **options: Any) -> "MeshChecker":
@@ -400,9 +404,3 @@ class MeshChecker:
         import torch
 
         return np.asarray(self.robot.sphere_centers(torch.from_numpy(q)).numpy())
-
-
-def _made(world: BakedWorld, robot: Robot, config: Any, *options: Any) -> MeshChecker:
-    """Make a checker of its arguments in order."""
-    names = ("links", "link_meshes", "resolution", "step", "seen")
-    return MeshChecker(world, robot, config, **dict(zip(names, options, strict=True)))

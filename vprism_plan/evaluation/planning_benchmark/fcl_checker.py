@@ -8,6 +8,8 @@ makes FCL fast enough for the same time limit as the others. Edges that the fiel
 clear are checked at configurations between which no point of the robot moves more than a step.
 """
 
+from functools import partial
+
 import numpy as np
 from jaxtyping import Float
 
@@ -34,6 +36,7 @@ class FclChecker(MeshChecker):
     ) -> None:
         config = CheckerConfig(margin=margin)
         super().__init__(world, robot, config, links="spheres", step=step, seen=False)
+        self._made = partial(FclChecker, world, robot, step, margin)
         self._field = CollisionChecker(world, robot, config)
 
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
