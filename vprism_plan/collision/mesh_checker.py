@@ -7,7 +7,7 @@ saw it takes from the images, so it can contradict the map as well.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -93,7 +93,7 @@ class MeshChecker:
         _fcl.fcl()
         if not (math.isfinite(step) and step >= 1e-5):
             raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
-        self._made: partial[MeshChecker] = partial(
+        self._made: Callable[[], MeshChecker] = partial(
             MeshChecker, world, robot, config, links=links, link_meshes=link_meshes,
             resolution=resolution, step=step, seen=seen,
         )  # fmt: skip
