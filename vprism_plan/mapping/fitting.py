@@ -170,7 +170,7 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     # New ground is where the old lattice did not reach: nodes it already has stay its own.
     added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
     hinges = np.concatenate([old.space.hinges, added])
-    _check_hinge_count(len(hinges), config)
+    _check_hinge_count(len(hinges), data, config)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     prior = expand_prior(old.space, old.posterior, space, config)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
@@ -286,7 +286,7 @@ def new_hinges(
         lattice = lattice[needed]
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
     hinges = np.concatenate([lattice, surface])
-    _check_hinge_count(len(hinges), config)
+    _check_hinge_count(len(hinges), data, config)
     return hinges
 
 
@@ -305,11 +305,13 @@ def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapCon
     )  # fmt: skip
 
 
-def _check_hinge_count(count: int, config: MapConfig) -> None:
+def _check_hinge_count(count: int, data: TrainingData, config: MapConfig) -> None:
     if count > config.max_hinges:
+        size = float((data.upper - data.lower).max())
         raise MapError(
-            f"the scene needs {count} hinge points, more than max_hinges = "
-            f"{config.max_hinges}; raise it, raise hinge_spacing, or label fewer objects"
+            f"the scene needs {count} hinge points, more than max_hinges = {config.max_hinges}; "
+            f"its largest object measures {size:.2f} m: if that is wrong, check labels and the scale "
+            "of depth (metres), else raise max_hinges or hinge_spacing, or label fewer objects"
         )
 
 
