@@ -311,7 +311,7 @@ def _check_hinge_count(count: int, data: TrainingData, config: MapConfig) -> Non
         raise MapError(
             f"the scene needs {count} hinge points, more than max_hinges = {config.max_hinges}; "
             f"its largest object measures {size:.2f} m: if that is wrong, check labels and the "
-            "scale of depth (metres), else raise max_hinges or hinge_spacing, or label fewer objects"
+            "scale of depth (metres), else raise max_hinges or hinge_spacing, or label less"
         )
 
 
