@@ -8,7 +8,6 @@ from oracles.checker_oracle import sphere_positions
 from scipy.spatial import cKDTree
 
 import vprism_plan as vp
-from vprism_plan.perception.camera import pixel_rays
 from vprism_plan.world.known import Box, Cylinder, HalfSpace
 from vprism_plan.world.lost_depth import lost_cones
 
@@ -62,11 +61,12 @@ class Oracle:
         for view in self.map.views:
             points, labels = view.points()
             found.append(points[labels == object_id])
-            rays = pixel_rays(view.shape, view.intrinsics) @ view.pose[:3, :3].T
-            for lost_id, start, end in lost_cones(view, self.map.plane):
-                for v, u in np.argwhere((start < end) & (lost_id == object_id)):
-                    depths = np.arange(start[v, u], min(end[v, u], 3.0) + FINE, FINE)
-                    found.append(view.camera_center + depths[:, None] * rays[v, u])
+            for cone in lost_cones(view, self.map.plane):
+                if cone.object_id != object_id:
+                    continue
+                for ray, start, end in zip(cone.rays, cone.start, cone.end, strict=True):
+                    depths = np.arange(start, min(end, 3.0) + FINE, FINE)
+                    found.append(view.camera_center + depths[:, None] * ray)
         return np.concatenate(found)
 
     @cached_property

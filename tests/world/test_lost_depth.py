@@ -93,8 +93,9 @@ def test_a_hole_in_an_object_begins_at_its_surface():
     lost = np.zeros(view.shape, bool)
     middle = np.argwhere(view.labels == 1).mean(axis=0).astype(int)
     lost[middle[0] - 3 : middle[0] + 3, middle[1] - 3 : middle[1] + 3] = True
-    ((_, start, end),) = lost_cones(without_depth(view, lost), TABLE)
-    before, behind = view.depth[lost] - start[lost], end[lost] - view.depth[lost]
+    (cone,) = lost_cones(without_depth(view, lost), TABLE)
+    np.testing.assert_array_equal(cone.pixels, np.argwhere(lost))
+    before, behind = view.depth[lost] - cone.start, cone.end - view.depth[lost]
     assert (before > 0.0).all()
     assert (behind > 0.0).all()
     assert max(before.max(), behind.max()) < 0.05

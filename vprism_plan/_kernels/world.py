@@ -137,6 +137,16 @@ def edt_pass_x(d, labels, first, step, out_d, out_l, start, stop):
 
 
 @njit(cache=True, nogil=True)
+def round_down(values, out):
+    """out (n,) float32: the nearest that is not above each value (n,)."""
+    for i in range(values.size):
+        single = np.float32(values[i])
+        if single > values[i]:
+            single = np.nextafter(single, np.float32(-np.inf))
+        out[i] = single
+
+
+@njit(cache=True, nogil=True)
 def fill_blocks(lattice, starts, labels, size):
     """Write labels[i] into the (size + 1)^3 nodes of the block that begins at starts[i]."""
     for i in range(starts.shape[0]):
@@ -165,6 +175,23 @@ def mark_boxes(points, half, origin, spacing, label, lattice):
             for y in range(lo[1], hi[1] + 1):
                 for z in range(lo[2], hi[2] + 1):
                     lattice[x, y, z] = label
+
+
+@njit(cache=True, nogil=True)
+def mark_corners(status, marks, nodes, start, stop):
+    """nodes (x + 1, y + 1, z + 1): the largest mark of the cells around each, by the status of
+    the cells (x, y, z); in layers start to stop."""
+    nx, ny, nz = status.shape
+    column = np.zeros(nz + 2, np.uint8)
+    for i in range(start, stop):
+        for j in range(ny + 1):
+            column[:] = 0
+            for a in range(max(i - 1, 0), min(i + 1, nx)):
+                for b in range(max(j - 1, 0), min(j + 1, ny)):
+                    for k in range(nz):
+                        column[k + 1] = max(column[k + 1], marks[status[a, b, k]])
+            for k in range(nz + 1):
+                nodes[i, j, k] = max(column[k], column[k + 1])
 
 
 @njit(cache=True, nogil=True)

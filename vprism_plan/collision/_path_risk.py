@@ -46,6 +46,7 @@ class PathRisk:
         # Probabilities are of touching; verdicts keep the margin as well, and touch a voxel
         # at its corners.
         self._at = make_setting(world, robot, config, rules, link_rules)
+        self._corners = grown(self._at, CORNER)
         self._kept = grown(with_margin(self._at, config.margin), CORNER)
         worlds = self._at.worlds
         lower, upper = clopper_pearson(config.n_worlds, config.confidence)
@@ -97,6 +98,7 @@ class PathRisk:
             other = copy.copy(self)
             worlds = self._at.worlds
             other._at = replace(self._at, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
+            other._corners = grown(other._at, CORNER)
             self._held_out = other
         return self._held_out
 
@@ -132,7 +134,7 @@ class PathRisk:
         at = grown(self._kept, -CORNER) if with_margin else self._at
         path = path.copy()
         n, inside = at.worlds.n_worlds, 0
-        around = sweep = count_path(grown(at, CORNER), path)
+        around = sweep = count_path(self._kept if with_margin else self._corners, path)
         if around.touched.any():
             sweep = recount(at, around)
             # A draw that occupies the centre of a voxel occupies that point, whatever voxels are.

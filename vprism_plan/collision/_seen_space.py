@@ -15,7 +15,7 @@ from vprism_plan.collision._solids import PlacedSolids
 from vprism_plan.collision.mesh_reports import SEEN
 from vprism_plan.robots._sphere_checks import drawn_points
 from vprism_plan.world import visibility
-from vprism_plan.world.lost_depth import lost_points
+from vprism_plan.world.lost_depth import lost_cones, lost_points
 from vprism_plan.world.seen_surfaces import surface_points
 
 _CELL = 0.03  # metres: one sample of a solid's surface per cube of this edge
@@ -45,12 +45,14 @@ class SeenPoints:
             map_.views, map_.plane, config.background_height, config.lone_share, bounded
         )
         parts = [(0, points, half)]
-        parts += surface_points(map_.views, map_.object_ids, map_.plane, None, world.grid, bounded)
+        parts += surface_points(map_.views, map_.object_ids, map_.plane, bounded)
         bodies = [("background", SEEN), *((f"object:{i}", SEEN) for i in map_.object_ids)]
         step, judged = config.resolution, judged_field(world)
         for view in map_.views:
-            cones = lost_points(view, map_.plane, judged.origin, judged.upper, step)
-            for object_id, points, half in cones:
+            cones = lost_cones(view, map_.plane)
+            for object_id, points, half in lost_points(
+                view, cones, judged.origin, judged.upper, step
+            ):
                 body = (f"object:{object_id}", "labelled there, without a depth return")
                 bodies += [] if body in bodies else [body]
                 parts.append((bodies.index(body), points, half - 0.5 * step))

@@ -74,10 +74,9 @@ def _metres(squares: Int32[np.ndarray, "x y z"], spacing: float) -> Float32[np.n
 
 def round_down(values: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
     """Nearest float32 that is not above the value: a lower bound stays one."""
-    single = values.astype(np.float32)
-    above = single > values
-    single[above] = np.nextafter(single[above], np.float32(-np.inf))
-    return single
+    flat, single = np.ascontiguousarray(values).reshape(-1), np.empty(values.size, np.float32)
+    run_chunked(lambda s: kernels.round_down(flat[s], single[s]), flat.size, 1 << 18)
+    return single.reshape(values.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,14 +231,16 @@ def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
 def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
     """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
     distance = np.empty(grid.shape, dtype=np.float32)
-    source = np.empty(grid.shape, dtype=np.int16)
     for start in range(0, grid.shape[0], 16):
         stop = min(start + 16, grid.shape[0])
-        nodes = grid.slab(start, stop)
-        bound = np.maximum(field.lower_bound(nodes), 0.0)
+        bound = np.maximum(field.lower_bound(grid.slab(start, stop)), 0.0)
         distance[start:stop] = round_down(bound).reshape(-1, *grid.shape[1:])
-        source[start:stop] = field.source_at(nodes).reshape(-1, *grid.shape[1:])
-    return NodeDistances(distance, source)
+    ends = (np.stack([grid.origin, grid.upper]) - field.origin) / field.spacing
+    nearest = [
+        np.clip(np.rint(np.linspace(first, last, n)), 0, size - 1).astype(int)
+        for first, last, n, size in zip(*ends, grid.shape, field.source.shape, strict=True)
+    ]
+    return NodeDistances(distance, field.source[np.ix_(*nearest)])
 
 
 def finish(

@@ -6,10 +6,11 @@ nearer than its neighbours and its foot on the support surface allow, and no far
 that surface.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from vprism_plan.perception import Observation, Plane
@@ -32,80 +33,106 @@ def lost_objects(view: Observation) -> tuple[int, ...]:
     return tuple(int(i) for i in ids)
 
 
-def lost_cones(
-    view: Observation, plane: Plane | None
-) -> Iterator[tuple[int, Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]]:
-    """Yield each id of `lost_objects` and between which depths (m) its pixels' cones lie.
+@dataclass(frozen=True)
+class Cone:
+    """Where an object may be, along the rays of pixels that carry its label and no depth.
+
+    Attributes:
+        object_id: the label.
+        pixels: (n, 2) row and column.
+        rays: (n, 3) world directions at depth 1.
+        start, end: (n,) depths, metres.
+    """
+
+    object_id: int
+    pixels: Int[np.ndarray, "n 2"]
+    rays: Float[np.ndarray, "n 3"]
+    start: Float[np.ndarray, " n"]
+    end: Float[np.ndarray, " n"]
+
+
+def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
+    """Return where the `lost_objects` may be, an entry for each that has more than small holes.
 
     The cone of a pixel without a return runs from the nearest depth at which the object's
     surface is plausible to the farthest, or to the support surface. Nearest is the farthest of:
     the upright plane through the front of its foot, of its other points and of what is seen
     beside its mask, moved towards the camera by half its width; the height of 40 cm; and its
     own nearest seen surface, continued towards the camera at two metres per metre. Farthest is
-    that surface continued away from the camera. Other pixels have no cone: inf, -inf; nor have
-    holes of up to four pixels, as noise leaves them in what was seen.
+    that surface continued away from the camera. Holes of up to four pixels, as noise leaves
+    them in what was seen, have no cone.
     """
-    lost_ids = lost_objects(view)
-    if not lost_ids:
-        return
-    rays = pixel_rays(view.shape, view.intrinsics) @ view.pose[:3, :3].T
-    points = view.point_image()
-    at_plane = np.full(view.shape, np.inf)
-    if plane is not None:
-        sinking = -(rays @ plane.normal)
-        height = float(plane.signed_distance(view.camera_center))
-        at_plane[sinking > 0.0] = height / sinking[sinking > 0.0]
-    for object_id in lost_ids:
-        mask = view.labels == object_id
-        lost = mask & (view.depth == 0)
+    found: list[Cone] = []
+    for object_id in lost_objects(view):
+        whole = view.labels == object_id
+        window = _window(whole, _HOLE)
+        mask, depth = whole[window], view.depth[window].astype(np.float64)
+        lost = mask & (depth == 0)
         lost &= ~ndimage.binary_closing(mask & ~lost, np.ones((_HOLE, _HOLE), dtype=bool))
-        start, end = _beside_own_surface(view, mask)
+        if not lost.any():
+            continue
+        rays = pixel_rays(view.shape, view.intrinsics)[window] @ view.pose[:3, :3].T
+        start, end = _beside_own_surface(view, depth, mask)
         if plane is not None:
+            sinking = -(rays @ plane.normal)
+            at_plane = np.full(mask.shape, np.inf)
+            height = float(plane.signed_distance(view.camera_center))
+            at_plane[sinking > 0.0] = height / sinking[sinking > 0.0]
+            points = view.point_image()[window]
             foot = _before_foot(view, plane, mask, lost, rays, points, at_plane)
-            start = np.maximum(start, foot)
-        end = np.minimum(end, at_plane)
-        yield object_id, np.where(lost, start, np.inf), np.where(lost, end, -np.inf)
+            start, end = np.maximum(start, foot), np.minimum(end, at_plane)
+        lost &= start < end
+        pixels = np.argwhere(lost) + np.array([w.start for w in window])
+        found.append(Cone(object_id, pixels, rays[lost], start[lost], end[lost]))
+    return found
+
+
+def _window(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+    """Rows and columns of the mask's box, grown by a margin within the image."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return (
+        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
+        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
+    )
 
 
 def lost_points(
     view: Observation,
-    plane: Plane | None,
+    cones: Sequence[Cone],
     lower: Float[np.ndarray, " 3"],
     upper: Float[np.ndarray, " 3"],
     step: float,
 ) -> Iterator[tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]]:
-    """Yield points `step` apart along all `lost_cones` in a box, with the half edge of cubes
-    around them that hold the cones; piece by piece, world, metres."""
+    """Yield points `step` apart along a view's `lost_cones` in a box, with the half edge of
+    cubes around them that hold the cones; piece by piece, with the object's id, world, metres."""
     eye = view.camera_center
     focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-    for object_id, start, end in lost_cones(view, plane):
-        pixels = np.argwhere(start < end)
-        rays = pixel_rays(view.shape, view.intrinsics)[tuple(pixels.T)] @ view.pose[:3, :3].T
-        length = np.linalg.norm(rays, axis=1)
+    for cone in cones:
+        rays, length = cone.rays, np.linalg.norm(cone.rays, axis=1)
         with np.errstate(divide="ignore", invalid="ignore"):
             ways = np.stack([(lower - step - eye) / rays, (upper + step - eye) / rays])
-        first = np.fmax(start[tuple(pixels.T)], np.nanmax(ways.min(axis=0), axis=1))
-        last = np.fmin(end[tuple(pixels.T)], np.nanmin(ways.max(axis=0), axis=1))
+        first = np.fmax(cone.start, np.nanmax(ways.min(axis=0), axis=1))
+        last = np.fmin(cone.end, np.nanmin(ways.max(axis=0), axis=1))
         counts = np.ceil(np.maximum(last - first, 0.0) * length / step).astype(np.int64) + 1
         counts[last < first] = 0
-        for piece in np.array_split(np.arange(len(pixels)), counts.sum() // _PIECE + 1):
+        for piece in np.array_split(np.arange(len(rays)), counts.sum() // _PIECE + 1):
             count = counts[piece]
             owner = np.repeat(piece, count)
             index = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
             share = index / np.maximum(np.repeat(count, count) - 1, 1)
             depth = first[owner] + share * (last - first)[owner]
+            points = eye + depth[:, None] * rays[owner]
             # A pixel's corner is 0.71 of its width off its middle.
-            yield object_id, eye + depth[:, None] * rays[owner], 0.71 * depth / focal + 0.5 * step
+            yield cone.object_id, points, 0.71 * depth / focal + 0.5 * step
 
 
 def _beside_own_surface(
-    view: Observation, mask: Bool[np.ndarray, "h w"]
+    view: Observation, depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """Nearest and farthest depth that the object's own seen pixels allow; 0, inf without any."""
-    own = mask & (view.depth > 0)
+    own = mask & (depth > 0)
     if not own.any():
-        return np.zeros(view.shape), np.full(view.shape, np.inf)
-    depth = view.depth.astype(np.float64)
+        return np.zeros(mask.shape), np.full(mask.shape, np.inf)
     # Of several surfaces nearby, a flying pixel among them, each may be the one that goes on.
     size = 2 * _BESIDE + 1
     low = ndimage.minimum_filter(np.where(own, depth, np.inf), size, mode="nearest")
@@ -115,7 +142,7 @@ def _beside_own_surface(
     # The way to the side is measured at the depth sought.
     steep = _SLOPE * away / focal
     start = np.maximum(low[tuple(index)] - _NEAR, 0.0) / (1.0 + steep)
-    end = np.full(view.shape, np.inf)
+    end = np.full(mask.shape, np.inf)
     near = steep < 1.0
     end[near] = (high[tuple(index)] + _NEAR)[near] / (1.0 - steep[near])
     return start, end

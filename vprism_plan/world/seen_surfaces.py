@@ -6,10 +6,10 @@ the free space on both sides outweighs it. What was seen is there, so the world 
 points as obstacles.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
@@ -23,31 +23,30 @@ _STRAY_SHARE = 0.03  # as in the default map: fewer neighbours than this is a fl
 _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point may be free
 
 
+Surface = tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]
+
+
 def surface_points(
     views: Sequence[Observation],
     object_ids: Sequence[int],
     plane: Plane | None,
-    distance: Float32[np.ndarray, "nx ny nz"] | None,
-    grid: Grid,
     bounded: bool = False,
-) -> Iterator[tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]]:
-    """Yield, per object and view, observed points more than 4 mm off the level set.
+) -> list[Surface]:
+    """Return, per object and view, the observed points of its surface.
 
-    Nearer points are the level set's business: marking them would only thicken it. Points
-    less than 3 mm (or three standard deviations of the noise) above the support surface are
-    its own, and points that stand alone are flying pixels, unless they are beside others.
+    Points less than 3 mm (or three standard deviations of the noise) above the support surface
+    are its own, and points that stand alone are flying pixels, unless they are beside others.
 
     Args:
         views: what was fitted.
         object_ids: labels of the map's classes 1, 2, ...
         plane: support surface.
-        distance: of every grid node to the level set, metres; None for all points.
-        grid: the nodes.
         bounded: whether the support surface ends, so that what is lower counts as well.
 
-    Yields:
+    Returns:
         Class, points (world, metres) and half the width of their pixels.
     """
+    found = []
     for view in views:
         points, labels = view.points()
         depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
@@ -60,9 +59,16 @@ def surface_points(
                 height = plane.signed_distance(points[own])
                 height = np.abs(height) if bounded else height
                 own = own[height > np.maximum(THIN, 3.0 * sigma)]
-            if distance is not None:
-                own = own[_bound(points[own], distance, grid) > _OFF]
-            yield k, points[own], 0.5 * depth[own] / focal
+            found.append((k, points[own], 0.5 * depth[own] / focal))
+    return found
+
+
+def off_level_set(
+    points: Float[np.ndarray, "n 3"], distance: Float32[np.ndarray, "nx ny nz"], grid: Grid
+) -> Bool[np.ndarray, " n"]:
+    """Which points lie more than 4 mm off the level set, by the distance of every grid node to
+    it (metres). Nearer ones are its own business: marking them would only thicken it."""
+    return _bound(points, distance, grid) > _OFF
 
 
 def _bound(

@@ -1,103 +1,146 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Obstacles that no object of the map accounts for: what nobody saw, and seen surfaces."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from vprism_plan._kernels import world as kernels
+from vprism_plan._threads import run_chunked
 from vprism_plan.world import visibility
 from vprism_plan.world.config import OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import Lattice
 from vprism_plan.world.grid import Grid
-from vprism_plan.world.lost_depth import lost_objects, lost_points
-from vprism_plan.world.seen_surfaces import surface_points
+from vprism_plan.world.lost_depth import Cone, lost_cones, lost_objects, lost_points
+from vprism_plan.world.seen_surfaces import Surface, off_level_set, surface_points
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
 # Marks on that lattice; where several apply the largest wins.
 UNOBSERVED, OCCLUDED, BACKGROUND = 1, 2, 3  # and 3 + k: seen surface of class k
 
 
-def ids_without_depth(map_: Any) -> tuple[int, ...]:
-    """Labels of the map's views that have no return at all, sorted: no class of the map.
-
-    Their marks follow those of the classes, BACKGROUND + C + 1 and on.
-    """
-    found = {i for view in map_.views for i in lost_objects(view)}
-    return tuple(sorted(found - set(map_.object_ids)))
-
-
-def mark_unseen(
-    map_: Any,
-    views: Sequence[visibility.View],
-    config: WorldConfig,
-    occluded: OccludedPolicy,
-    grid: Grid,
-    objects: Float32[np.ndarray, "nx ny nz"] | None,
-    inner: Grid | None = None,
-    below: Sequence[visibility.View] | None = None,
-) -> Lattice:
-    """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
-    object of the map holds.
+class Evidence:
+    """What the views of a map say of space: what was seen, what hides, where nobody looked.
 
     Args:
         map_: the map.
-        views: its views, made ready by `visibility.make_view`.
-        config: policies; that for occluded space is given apart.
-        occluded: what to do with occluded space.
-        grid: nodes of the field; the marks are `CELLS` times finer.
-        objects: distance from its nodes to the level set, metres; None marks all that was
-            seen of the objects.
-        inner: another grid whose box is not to be marked.
-        below: the views once more, made ready without a plane, if the support surface ends.
+        config: policies, and what counts as seen.
+
+    Attributes:
+        views: ready to be asked of cells.
+        below: the same for which the support plane hides things, too; None if it never ends.
+        without_depth: labels without any return, sorted: no class of the map. Their marks follow
+            those of the classes, BACKGROUND + C + 1 and on.
     """
-    spacing = grid.spacing / CELLS
-    cells = tuple(CELLS * (n - 1) for n in grid.shape)
-    shape = (cells[0], cells[1], cells[2])
-    nodes = np.zeros(tuple(n + 1 for n in shape), dtype=np.uint8)
-    hole = None if inner is None else _cells_within(inner, grid.origin, spacing, shape)
-    if occluded != "free" or config.unobserved != "free":
-        place = grid.origin, spacing, shape
-        if below is None:
-            status = visibility.classify_cells(views, map_.plane, *place)
+
+    def __init__(self, map_: Any, config: WorldConfig) -> None:
+        self._map, self._config = map_, config
+        self.bounded = config.support == "seen" and map_.plane is not None
+        tolerance = config.occlusion_tolerance
+        self.views = visibility.make_views(map_.views, tolerance, map_.plane)
+        self.below = visibility.make_views(map_.views, tolerance) if self.bounded else None
+        found = {i for view in map_.views for i in lost_objects(view)}
+        self.without_depth = tuple(sorted(found - set(map_.object_ids)))
+
+    @cached_property
+    def _clutter(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+        config, m = self._config, self._map
+        return visibility.background_points(
+            m.views, m.plane, config.background_height, config.lone_share, self.bounded
+        )
+
+    @cached_property
+    def _surfaces(self) -> list[Surface]:
+        m = self._map
+        return surface_points(m.views, m.object_ids, m.plane, self.bounded)
+
+    @cached_property
+    def _cones(self) -> list[list[Cone]]:
+        return [lost_cones(view, self._map.plane) for view in self._map.views]
+
+    def marks(
+        self,
+        occluded: OccludedPolicy,
+        grid: Grid,
+        objects: Float32[np.ndarray, "nx ny nz"] | None,
+        inner: Grid | None = None,
+    ) -> Lattice:
+        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
+        object of the map holds.
+
+        Args:
+            occluded: what to do with occluded space.
+            grid: nodes of the field; the marks are `CELLS` times finer.
+            objects: distance from its nodes to the level set, metres; None marks all that was
+                seen of the objects.
+            inner: another grid whose box is not to be marked.
+        """
+        spacing = grid.spacing / CELLS
+        cells = tuple(CELLS * (n - 1) for n in grid.shape)
+        shape = (cells[0], cells[1], cells[2])
+        nodes = np.zeros(tuple(n + 1 for n in shape), dtype=np.uint8)
+        if occluded != "free" or self._config.unobserved != "free":
+            status = self._status(occluded, grid.origin, spacing, shape)
+            if inner is not None:
+                status[_cells_within(inner, grid.origin, spacing, shape)] = kernels.FREE
+            marks = self._marks_of_status(occluded)
+            run_chunked(
+                lambda s: kernels.mark_corners(status, marks, nodes, s.start, s.stop),
+                len(nodes),
+                16,
+            )
+        for label, points, half in self._seen(grid, objects, 0.5 * spacing):
+            kept: Any = slice(None)
+            if inner is not None:
+                kept = ((points < inner.origin) | (points > inner.upper)).any(axis=1)
+            kernels.mark_boxes(
+                points[kept], half[kept], grid.origin, spacing, np.uint8(label), nodes
+            )
+        return Lattice(nodes, grid.first * CELLS, CELLS)
+
+    def _status(
+        self,
+        occluded: OccludedPolicy,
+        origin: Float[np.ndarray, " 3"],
+        spacing: float,
+        shape: tuple[int, int, int],
+    ) -> UInt8[np.ndarray, "nx ny nz"]:
+        """What the views say of cells, and, where it decides, the posterior."""
+        place = self._map.plane, origin, spacing, shape
+        if self.below is None:
+            status = visibility.classify_cells(self.views, *place)
         else:
-            status = visibility.classify_cells_around(views, below, map_.plane, *place)
+            status = visibility.classify_cells_around(self.views, self.below, *place)
+        if occluded == "posterior":
+            _trust_posterior(self._map, self._config, status, origin, spacing)
+        return status
+
+    def _marks_of_status(self, occluded: OccludedPolicy) -> UInt8[np.ndarray, " 4"]:
         shadow = 0 if occluded == "free" else OCCLUDED
-        unseen = 0 if config.unobserved == "free" else UNOBSERVED
+        unseen = 0 if self._config.unobserved == "free" else UNOBSERVED
         marks = np.zeros(4, dtype=np.uint8)
         marks[kernels.OCCLUDED] = shadow
         marks[kernels.PARTLY] = shadow or unseen
         marks[kernels.UNOBSERVED] = unseen
-        if occluded == "posterior":
-            _trust_posterior(map_, config, status, grid.origin, spacing)
-        marked = marks[status]
-        if hole is not None:
-            marked[hole] = 0
-        _mark_corners(marked, nodes)
+        return marks
 
-    def mark(points: Float[np.ndarray, "n 3"], half: Float[np.ndarray, " n"], label: int) -> None:
-        if inner is not None:
-            kept = ((points < inner.origin) | (points > inner.upper)).any(axis=1)
-            points, half = points[kept], half[kept]
-        kernels.mark_boxes(points, half, grid.origin, spacing, np.uint8(label), nodes)
-
-    points, half = visibility.background_points(
-        map_.views, map_.plane, config.background_height, config.lone_share, below is not None
-    )
-    mark(points, half, BACKGROUND)
-    for k, points, half in surface_points(
-        map_.views, map_.object_ids, map_.plane, objects, grid, below is not None
-    ):
-        mark(points, half, BACKGROUND + k)
-    ids = (*map_.object_ids, *ids_without_depth(map_))
-    for view in map_.views:
-        for object_id, points, half in lost_points(
-            view, map_.plane, grid.origin, grid.upper, 0.5 * spacing
-        ):
-            mark(points, half, BACKGROUND + 1 + ids.index(object_id))
-    return Lattice(nodes, grid.first * CELLS, CELLS)
+    def _seen(
+        self, grid: Grid, objects: Float32[np.ndarray, "nx ny nz"] | None, step: float
+    ) -> Iterator[Surface]:
+        """Marks, points and half the widths of what was seen, the less important first."""
+        yield BACKGROUND, *self._clutter
+        for k, points, half in self._surfaces:
+            kept: Any = slice(None)
+            if objects is not None:
+                kept = off_level_set(points, objects, grid)
+            yield BACKGROUND + k, points[kept], half[kept]
+        ids = (*self._map.object_ids, *self.without_depth)
+        for view, cones in zip(self._map.views, self._cones, strict=True):
+            for object_id, points, half in lost_points(view, cones, grid.origin, grid.upper, step):
+                yield BACKGROUND + 1 + ids.index(object_id), points, half
 
 
 def _cells_within(
@@ -164,16 +207,3 @@ def unmark(marks: Lattice, classes: Collection[int], inside: Lattice | None) -> 
     target = labels[window]
     target[(part != 0) & (target == OCCLUDED)] = 0
     return Lattice(labels, marks.corner, CELLS)
-
-
-def _mark_corners(cells: UInt8[np.ndarray, "x y z"], nodes: UInt8[np.ndarray, "x1 y1 z1"]) -> None:
-    """Raise every node to the largest mark of the eight cells around it."""
-    x, y, z = cells.shape
-    grown = np.zeros((x + 1, y, z), dtype=np.uint8)
-    grown[:-1] = cells
-    np.maximum(grown[1:], cells, out=grown[1:])
-    wider = np.zeros((x + 1, y + 1, z), dtype=np.uint8)
-    wider[:, :-1] = grown
-    np.maximum(wider[:, 1:], grown, out=wider[:, 1:])
-    np.maximum(nodes[:, :, :-1], wider, out=nodes[:, :, :-1])
-    np.maximum(nodes[:, :, 1:], wider, out=nodes[:, :, 1:])

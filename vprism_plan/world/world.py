@@ -30,14 +30,13 @@ from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
 from vprism_plan.world.levelset import lattice_refinement, trace_level_set
 from vprism_plan.world.posterior_worlds import PosteriorWorlds
 from vprism_plan.world.rasterize import rasterize_level_set, rasterize_mesh
-from vprism_plan.world.support import RIM, SeenSupport, seen_support
+from vprism_plan.world.support import RIM, seen_support
 from vprism_plan.world.unseen import (
     BACKGROUND,
     CELLS,
     OCCLUDED,
     UNOBSERVED,
-    ids_without_depth,
-    mark_unseen,
+    Evidence,
     unmark,
 )
 
@@ -87,8 +86,9 @@ class World:
         self.map = map
         self.config = WorldConfig() if config is None else config
         self.timings: dict[str, float] = {}
-        self._bounded = self.config.support == "seen" and map.plane is not None
-        lost = ids_without_depth(map)
+        self._evidence = Evidence(map, self.config)
+        self._bounded = self._evidence.bounded
+        lost = self._evidence.without_depth
         if len(map.object_ids) + len(lost) > _MAX_OBJECTS:
             raise WorldError(
                 f"the map has {len(map.object_ids) + len(lost)} objects; a world holds at most "
@@ -114,17 +114,14 @@ class World:
         self.grid: Grid = choose_grid(
             map, self.config, None if box is None else (box[0] * fine, box[1] * fine)
         )
-        tolerance = self.config.occlusion_tolerance
-        self._views = visibility.make_views(map.views, tolerance, map.plane)
-        self._below: list[visibility.View] | None = None
-        self._support: SeenSupport | None = None
-        if self._bounded:
-            self._below = visibility.make_views(map.views, tolerance)
-            self._support = seen_support(map.views, map.plane)
+        self._support = seen_support(map.views, map.plane) if self._bounded else None
         self._objects: NodeDistances = self._timed(
             "distance to objects", self._object_distances, None
         )
-        self._unseen = self._timed("visibility", self._mark_unseen, self.config.occluded)
+        self._unseen: Lattice = self._timed(
+            "visibility", self._evidence.marks, self.config.occluded, self.grid,
+            self._objects.distance,
+        )  # fmt: skip
         self._marks_beyond = self._timed("beyond", self._mark_beyond)
         self._beyond, self._from_beyond = self._around(self._marks_beyond, True)
         known = self._timed("known geometry", self._known_distances, solids)
@@ -170,19 +167,10 @@ class World:
         planes.setflags(write=False)
         return tuple(names), planes
 
-    def _mark_unseen(self, occluded: OccludedPolicy) -> Lattice:
-        return mark_unseen(
-            self.map, self._views, self.config, occluded, self.grid, self._objects.distance,
-            below=self._below,
-        )  # fmt: skip
-
     def _mark_certain(self, seen: bool) -> Lattice:
         """Mark what is no business of the posterior's; with `seen`, all seen surfaces too."""
         occluded: OccludedPolicy = "free" if self.config.occluded == "free" else "posterior"
-        return mark_unseen(
-            self.map, self._views, self.config, occluded, self.grid,
-            None if seen else self._objects.distance, below=self._below,
-        )  # fmt: skip
+        return self._evidence.marks(occluded, self.grid, None if seen else self._objects.distance)
 
     def _unseen_distances(self, lattice: Lattice) -> NodeDistances:
         distance, label = distance_to_lattice(lattice, self.grid)
@@ -195,7 +183,7 @@ class World:
         """Index into `sources` of each mark of `world.unseen`, -1 for none, (256,)."""
         classes = len(self.map.object_ids)
         first = self.sources.index("unobserved") + 1
-        lost = len(ids_without_depth(self.map))
+        lost = len(self._evidence.without_depth)
         names = np.full(256, -1, dtype=np.int16)
         names[BACKGROUND] = self.sources.index("background")
         names[OCCLUDED] = self.sources.index("occluded")
@@ -209,10 +197,7 @@ class World:
         if self.config.unobserved == "occupied" or not self.map.views:
             return None
         occluded: OccludedPolicy = "free" if self.config.occluded == "free" else "occupied"
-        return mark_unseen(
-            self.map, self._views, self.config, occluded, self._grid_beyond, None,
-            inner=self.grid, below=self._below,
-        )  # fmt: skip
+        return self._evidence.marks(occluded, self._grid_beyond, None, inner=self.grid)
 
     @property
     def _grid_beyond(self) -> Grid:
@@ -402,7 +387,7 @@ class World:
             WorldError: a point is not finite.
         """
         points = checked_points(points)
-        status = visibility.classify_points(self._views, points)
+        status = visibility.classify_points(self._evidence.views, points)
         if self.map.plane is not None and not self._bounded:
             status[self.map.plane.signed_distance(points) < 0.0] = visibility.OCCLUDED
         judged = self.field if self._beyond is None else self._beyond
