@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
-EXTRAS ?= dev,evaluation,docs,viewer
+EXTRAS ?= dev,experiments,docs,viewer
 STAMP := $(VENV)/.installed
 
 .PHONY: demo test lint types docs bench clean
@@ -33,7 +33,7 @@ docs: $(STAMP)
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs/html
 
 bench: $(STAMP)
-	$(BIN)/python benchmarks/run_all.py
+	$(BIN)/python -m experiments.benchmarks.run_all
 
 # torch first: resolved later, another package would bring a CUDA build of several GB.
 $(STAMP): pyproject.toml

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vprism_plan as vp
-from vprism_plan.evaluation import Camera, hidden_object_scene, render
+from vprism_plan.simulation import Camera, hidden_object_scene, render
 from vprism_plan.viz import save_figure
 
 parser = argparse.ArgumentParser(description="What a second view adds to a map.")

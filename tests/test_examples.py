@@ -63,7 +63,7 @@ def test_margins_name_the_nearest_pair_and_keep_what_the_checker_keeps(said_by):
 
 @pytest.mark.slow
 def test_a_robot_without_spheres_gets_some_that_hold_it_and_a_path(said_by):
-    pytest.importorskip("pybullet_data", reason="pybullet is not installed (extra `evaluation`)")
+    pytest.importorskip("pybullet_data", reason="pybullet is not installed (extra `experiments`)")
     said = said_by("07")
     links = re.findall(r"lbr_iiwa_link_\d .*", said)
     assert len(links) == 8

@@ -56,7 +56,7 @@ def test_links_lead_somewhere(repository):
 
 def test_measured_numbers_name_commands_that_exist(repository):
     text = (repository / "README.md").read_text()
-    commands = re.findall(r"`python (benchmarks/[a-z_]+\.py)", text)
+    commands = re.findall(r"`python -m experiments\.benchmarks\.([a-z_]+)", text)
     assert len(commands) >= 4
     for command in commands:
-        assert (repository / command).is_file()
+        assert (repository / "experiments" / "benchmarks" / f"{command}.py").is_file()

@@ -30,8 +30,8 @@ def run_demo(output: Path, seed: int, console: "Console") -> int:
     from vprism_plan.cli._placing import Surroundings, base_pose
     from vprism_plan.collision import CheckerConfig, CollisionChecker
     from vprism_plan.errors import PlanningError
-    from vprism_plan.evaluation import load_ground_truth
     from vprism_plan.robots import Robot
+    from vprism_plan.simulation import load_ground_truth
     from vprism_plan.world import World
 
     folder = data_path("demo_scene")

@@ -16,7 +16,7 @@ PACKAGES = (
     "planning",
     "trajopt",
     "viz",
-    "evaluation",
+    "simulation",
 )
 
 

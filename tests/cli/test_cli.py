@@ -10,9 +10,9 @@ import pytest
 
 import vprism_plan as vp
 from vprism_plan.cli import main
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene, render
-from vprism_plan.evaluation.solids import Box
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene, render
+from vprism_plan.simulation.solids import Box
 
 
 @pytest.fixture(scope="module")

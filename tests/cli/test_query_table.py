@@ -7,9 +7,9 @@ import pytest
 
 import vprism_plan as vp
 from vprism_plan.cli import main
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene, render
-from vprism_plan.evaluation.solids import Box
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene, render
+from vprism_plan.simulation.solids import Box
 
 BASE = ("--base-xyz", "-0.4", "0", "-0.1")
 FREE, BLOCKED = ("1.2", "0.1", "0"), ("0", "0", "0")

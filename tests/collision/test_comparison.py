@@ -20,9 +20,9 @@ from vprism_plan.collision.mesh_reports import (
 )
 from vprism_plan.collision.reports import Contact
 from vprism_plan.errors import RobotError
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene
-from vprism_plan.evaluation.solids import Box
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.solids import Box
 from vprism_plan.world.known import HalfSpace, Sphere
 
 SLIDER = """<robot name="slider">

@@ -389,8 +389,8 @@ def test_background_is_certain_and_named(ball_robot):
     """A thing without a label is an obstacle in every world."""
     from oracles.small_scenes import small_config, small_scene
 
-    from vprism_plan.evaluation.scenes import Scene
-    from vprism_plan.evaluation.solids import sphere
+    from vprism_plan.simulation.scenes import Scene
+    from vprism_plan.simulation.solids import sphere
 
     scene = small_scene()
     clutter = sphere(0.03, at(-0.05, 0.2, 0.03))

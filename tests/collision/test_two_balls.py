@@ -9,9 +9,9 @@ from oracles.small_scenes import at
 
 import vprism_plan as vp
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene
-from vprism_plan.evaluation.solids import sphere
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.solids import sphere
 
 OFFSETS = (0.06, 0.065, 0.07, 0.08)  # behind the balls' centres, metres
 WAYPOINTS = (16, 32, 64, 128)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene, random_scene, render
 from vprism_plan.mapping import MapConfig, VPrismMap, fit_map
 from vprism_plan.mapping.em import Posterior, diagonal_prior, fit_weights
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
 from vprism_plan.perception import Observation
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene, random_scene, render
 
 COARSE = MapConfig(hinge_spacing=0.06, surface_hinges=10, iterations=3, below_plane_samples=500)
 

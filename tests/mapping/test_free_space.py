@@ -7,10 +7,10 @@ import pytest
 
 import vprism_plan as vp
 from vprism_plan.errors import ConfigError
-from vprism_plan.evaluation import demo_scene, random_scene
 from vprism_plan.mapping.fitting import learning_problem
 from vprism_plan.mapping.free_space import needed_nodes
 from vprism_plan.perception.plane import Plane
+from vprism_plan.simulation import demo_scene, random_scene
 
 SPACING, MARGIN = 0.04, 0.04
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)

@@ -3,7 +3,7 @@
 
 import pytest
 
-from vprism_plan.evaluation.lattice import ball_scene, shift_lattice
+from experiments.lattice import ball_scene, shift_lattice
 from vprism_plan.mapping import MapConfig
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 import vprism_plan as vp
-from vprism_plan.evaluation.scenes import demo_scene
 from vprism_plan.mapping.strays import stray_points
+from vprism_plan.simulation.scenes import demo_scene
 
 
 def surface_and_strays(rng):

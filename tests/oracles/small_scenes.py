@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene
-from vprism_plan.evaluation.solids import Box, sphere
 from vprism_plan.mapping import MapConfig, fit_map
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.solids import Box, sphere
 
 
 def at(x, y, z):

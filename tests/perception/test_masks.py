@@ -8,10 +8,10 @@ from scipy.ndimage import grey_dilation
 from scipy.spatial import cKDTree
 
 from vprism_plan.errors import ObservationError
-from vprism_plan.evaluation.scenes import random_scene
 from vprism_plan.mapping import MapConfig, fit_map
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.masks import drop_background, mend
+from vprism_plan.simulation.scenes import random_scene
 
 SHAPE = (480, 640)
 K = intrinsics(640, 480)

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from oracles.world_oracles import KernelMap
 from scipy.spatial.transform import Rotation
 
-from vprism_plan.evaluation import solids as shapes
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import Scene, render
 from vprism_plan.perception import Observation, Plane, ignore_robot, ignore_self
 from vprism_plan.robots import Robot
+from vprism_plan.simulation import solids as shapes
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import Scene, render
 from vprism_plan.world import World, WorldConfig
 from vprism_plan.world.visibility import depth_sigma
 

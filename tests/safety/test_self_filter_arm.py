@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import vprism_plan as vp
-from vprism_plan.evaluation import solids as shapes
-from vprism_plan.evaluation.camera import DepthNoise
-from vprism_plan.evaluation.scenes import Scene, demo_scene, render
 from vprism_plan.perception import ignore_self
+from vprism_plan.simulation import solids as shapes
+from vprism_plan.simulation.camera import DepthNoise
+from vprism_plan.simulation.scenes import Scene, demo_scene, render
 
 Q = np.array([1.165, 0.402, -0.404, -2.102, -1.637, 1.372, -2.476])
 BASE = np.array([[0, -1, 0, 0.05], [1, 0, 0, -0.6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=float)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vprism_plan as vp
-from vprism_plan.evaluation.scenes import hidden_object_scene, random_scene
+from vprism_plan.simulation.scenes import hidden_object_scene, random_scene
 
 RADIUS = 0.015
 

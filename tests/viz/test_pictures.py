@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 import vprism_plan as vp
-from vprism_plan.evaluation import load_ground_truth, random_scene
+from vprism_plan.simulation import load_ground_truth, random_scene
 from vprism_plan.viz import (
     map_figure,
     object_color,

@@ -10,7 +10,7 @@ import pytest
 import vprism_plan as vp
 from vprism_plan.cli import main
 from vprism_plan.errors import ConfigError, MissingDependencyError
-from vprism_plan.evaluation import Box, Camera, Scene, render
+from vprism_plan.simulation import Box, Camera, Scene, render
 from vprism_plan.viz._viewer_parts import EntropyVolume, place_solids, robot_solids
 
 viser = pytest.importorskip("viser", reason="viser is not installed (extra `viewer`)")

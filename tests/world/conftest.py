@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from oracles.world_oracles import KernelMap, level_points, random_map
 
-from vprism_plan.evaluation.scenes import hidden_object_scene
 from vprism_plan.mapping import MapConfig, fit_map
 from vprism_plan.perception import Plane
+from vprism_plan.simulation.scenes import hidden_object_scene
 from vprism_plan.world import World, WorldConfig
 
 

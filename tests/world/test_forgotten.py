@@ -3,9 +3,9 @@
 import numpy as np
 
 import vprism_plan as vp
-from vprism_plan.evaluation.camera import Camera, DepthNoise
-from vprism_plan.evaluation.scenes import Scene
-from vprism_plan.evaluation.solids import Box
+from vprism_plan.simulation.camera import Camera, DepthNoise
+from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.solids import Box
 
 
 def upright(x, y, z):
@@ -38,7 +38,7 @@ def test_a_thin_bar_that_was_seen_is_an_obstacle_even_where_the_map_says_free():
 
 
 def test_flying_pixels_are_no_forgotten_surfaces():
-    from vprism_plan.evaluation.scenes import demo_scene
+    from vprism_plan.simulation.scenes import demo_scene
 
     scene = demo_scene()
     world = vp.World(vp.fit_map(scene.observation), vp.WorldConfig(occluded="free"))

@@ -14,8 +14,8 @@ from oracles.worlds_oracle import draw_logits, draw_owners, owners_of
 
 import vprism_plan as vp
 from vprism_plan.errors import WorldError
-from vprism_plan.evaluation.scenes import Scene
-from vprism_plan.evaluation.solids import sphere
+from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.solids import sphere
 from vprism_plan.world.posterior_worlds import PosteriorWorlds
 
 H = 0.01

@@ -6,9 +6,9 @@ import pytest
 from oracles.world_oracles import KernelMap, point_status
 
 from vprism_plan._kernels import world as kernels
-from vprism_plan.evaluation.camera import Camera
-from vprism_plan.evaluation.scenes import hidden_object_scene, render
 from vprism_plan.perception import Observation, Plane
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scenes import hidden_object_scene, render
 from vprism_plan.world import World, WorldConfig
 from vprism_plan.world.visibility import (
     OCCLUDED,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `vprism-plan demo | map | plan | query | mesh | robot | view | eval`.
+"""The command line: `vprism-plan demo | map | plan | query | mesh | robot | view`.
 
 Exit codes: 0 done, 1 no safe answer, 2 bad input, 130 interrupted; 3 is a defect of
 this program, with a traceback to report.

@@ -229,44 +229,7 @@ class RobotInfo:
     """Print one JSON object instead of text."""
 
 
-@dataclass(frozen=True)
-class Eval:
-    """Compare methods or checkers on generated scenes whose truth is known; write a report.
-
-    Results are kept scene by scene: started again, even after a kill, it computes only what is
-    missing. Needs the extra `evaluation`.
-    """
-
-    table: Positional[Literal["baselines", "sampling", "presets", "uncertainty", "planning"]]
-    """What to compare: reconstruction by V-PRISM and others, by its negative sampling, by its
-    presets; uncertainty by SGD; collision checkers."""
-    set: Literal["all", "analytic", "ycb", "random", "random-train", "folder"] = "all"
-    """Objects of the scenes; "all" is analytic, ycb and random."""
-    scenes: Annotated[int | None, arg(metavar="INT")] = None
-    """Scenes of each set, default 100, for uncertainty 30; for planning of all sets together,
-    default 30."""
-    first_seed: int = 1000
-    """Seed of the first scene; the others follow. 0 to 99 are for tuning."""
-    methods: Annotated[tuple[str, ...], arg(metavar="KEY ...")] = ()
-    """Only these rows, in this order; default all of the table's. For planning, checkers."""
-    data: Annotated[Path | None, arg(metavar="PATH")] = None
-    """Folder of meshes (m) for --set folder, or of the YCB objects."""
-    store: Annotated[Path | None, arg(metavar="PATH")] = None
-    """Folder that keeps every result; default build/evaluation."""
-    output: Annotated[Path | None, arg(metavar="PATH")] = None
-    """Folder for the report: Markdown, JSON, pictures; default docs/results in a checkout of
-    this project, else results."""
-    jobs: int = 2
-    """Processes, one thread each."""
-    backend: Literal["loky", "dask", "ray"] = "loky"
-    """Where they run: here, or on a Dask or Ray cluster."""
-    cluster: Annotated[str | None, arg(metavar="ADDRESS")] = None
-    """Address of that cluster; default: one is started here."""
-    json: bool = False
-    """Print one JSON object instead of text."""
-
-
-Command = Demo | Map | Plan | Query | Mesh | View | RobotInfo | Eval
+Command = Demo | Map | Plan | Query | Mesh | View | RobotInfo
 CommandLine = AvoidSubcommands[
     Annotated[Demo, subcommand("demo")]
     | Annotated[Map, subcommand("map")]
@@ -275,5 +238,4 @@ CommandLine = AvoidSubcommands[
     | Annotated[Mesh, subcommand("mesh")]
     | Annotated[View, subcommand("view")]
     | Annotated[RobotInfo, subcommand("robot")]
-    | Annotated[Eval, subcommand("eval")]
 ]

@@ -3,7 +3,7 @@
 
 from importlib import import_module
 
-from vprism_plan.cli._commands import Command, Demo, Eval, Map, Mesh, Plan, Query, RobotInfo, View
+from vprism_plan.cli._commands import Command, Demo, Map, Mesh, Plan, Query, RobotInfo, View
 from vprism_plan.cli._console import Console
 
 # Command -> module of this folder and its function (command, console) -> exit code.
@@ -14,7 +14,6 @@ _RUNNERS: dict[type, tuple[str, str]] = {
     Query: ("_query", "run_query"),
     View: ("_view", "run_view"),
     RobotInfo: ("_robot", "run_robot"),
-    Eval: ("_evaluate", "run_eval"),
 }
 
 

@@ -187,8 +187,8 @@ def solve_pose(
     """Find configurations that bring a link to a pose.
 
     From random starts within the joint limits, in float64, with mimic and continuous joints.
-    (`benchmarks/inverse_kinematics.py` compares pytorch-kinematics' solver: it reads its
-    offsets in float32 and leaves mimic joints out.)
+    (pytorch-kinematics' solver reads its offsets in float32 and leaves mimic joints out:
+    `experiments.benchmarks.inverse_kinematics`.)
 
     Args:
         robot: with `arrays` and `link_poses`.

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What a validity check costs inside OMPL, and what a query costs on the demo scene.
+
+    python -m experiments.benchmarks.ompl_callbacks [--map map.safetensors]
+
+Ratios are taken within this one run: absolute times depend on the machine.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from ompl import base as ob
+
+import vprism_plan as vp
+from vprism_plan.planning import (
+    VPrismMotionValidator,
+    VPrismStateValidityChecker,
+    plan,
+    quiet_ompl,
+    state_space,
+    to_state,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+START = np.array([0.5, 0.67, 0.0, -1.6, 0.0, 2.27, 0.785])
+GOAL = np.array([-0.35, 0.3, 0.0, -1.85, 0.0, 2.15, 0.785])
+ROUNDS, STATES = 15, 2000
+
+
+class EmptyCallback(ob.StateValidityChecker):
+    """What OMPL's Python bindings cost with nothing behind them."""
+
+    def isValid(self, state: ob.State) -> bool:  # noqa: N802
+        return True
+
+
+def demo_checker(map_file: Path | None) -> vp.CollisionChecker:
+    if map_file is not None:
+        fitted = vp.load_map(map_file)
+    else:
+        fitted = vp.fit_map(vp.load_observation(ROOT / "vprism_plan" / "data" / "demo_scene"))
+    base = np.eye(4)
+    base[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    base[:3, 3] = [0.05, -0.6, 0.0]
+    robot = vp.Robot.from_urdf(ROOT / "urdf" / "panda.urdf", base_pose=base)
+    return vp.CollisionChecker(vp.World(fitted), robot)
+
+
+def spaces(checker: vp.CollisionChecker) -> tuple[ob.SpaceInformation, ob.SpaceInformation]:
+    """An OMPL program with our two classes, and one with an empty callback."""
+    ours = ob.SpaceInformation(state_space(checker.robot))
+    ours.setStateValidityChecker(VPrismStateValidityChecker(ours, checker))
+    ours.setMotionValidator(VPrismMotionValidator(ours, checker))
+    empty = ob.SpaceInformation(state_space(checker.robot))
+    empty.setStateValidityChecker(EmptyCallback(empty))
+    with quiet_ompl():
+        ours.setup()
+        empty.setup()
+    return ours, empty
+
+
+def alternate(*tasks: Callable[[], object]) -> list[float]:
+    """Best seconds of each task; they take turns, so a busy machine hits all alike."""
+    best = [np.inf] * len(tasks)
+    for _ in range(ROUNDS):
+        for i, task in enumerate(tasks):
+            began = time.perf_counter()
+            task()
+            best[i] = min(best[i], time.perf_counter() - began)
+    return best
+
+
+def callbacks(checker: vp.CollisionChecker) -> None:
+    robot = checker.robot
+    ours, empty = spaces(checker)
+    rng = np.random.default_rng(0)
+    sample = rng.uniform(robot.lower, robot.upper, (STATES, robot.dof))
+    valid = checker.is_valid_batch(sample)
+    along = START + np.linspace(0.0, 1.0, STATES)[:, None] * (GOAL - START)
+    sets = {
+        "random states": sample,
+        "random valid states": sample[valid],
+        "random invalid states": sample[~valid],
+        "states on the line from start to goal": along,
+    }
+    print("isValid through OMPL, ours against an empty callback (microseconds per call)")
+    for name, configurations in sets.items():
+        rows = [np.ascontiguousarray(q) for q in configurations]
+        a = [to_state(ours.getStateSpace(), q) for q in rows]
+        b = [to_state(empty.getStateSpace(), q) for q in rows]
+        asked, nothing, alone = alternate(
+            lambda a=a: [ours.isValid(state) for state in a],
+            lambda b=b: [empty.isValid(state) for state in b],
+            lambda rows=rows: [checker.is_valid_buffer(q) for q in rows],
+        )
+        scale = 1e6 / len(rows)
+        print(
+            f"  {name:38s} {scale * asked:6.2f} / {scale * nothing:5.2f} = "
+            f"{asked / nothing:5.1f} times   (the check alone {scale * alone:.2f})"
+        )
+
+
+def queries(checker: vp.CollisionChecker) -> None:
+    plan(checker, START, GOAL)
+    times, parts = [], []
+    for seed in range(20):
+        began = time.perf_counter()
+        result = plan(checker, START, GOAL, "RRTConnect", seed=seed)
+        times.append(time.perf_counter() - began)
+        if not result.solved:
+            raise SystemExit(f"seed {seed}: {result.status}: {result.message}")
+        report = result.report
+        parts.append((report.planning_time, report.simplification_time, report.verification_time))
+    search, shorten, verify = 1e3 * np.median(parts, axis=0)
+    print(
+        f"RRTConnect query on the demo scene, 20 seeds, after warm-up: median "
+        f"{1e3 * np.median(times):.1f} ms, slowest {1e3 * max(times):.1f} ms "
+        f"(medians: search {search:.1f}, shortening {shorten:.1f}, verification {verify:.1f} ms)"
+    )
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--map", type=Path, help="a saved map of the demo scene, to skip the fit")
+    checker = demo_checker(parser.parse_args().map)
+    for q in (START, GOAL):
+        if not checker.is_valid(q):
+            raise SystemExit(f"{q.tolist()} is invalid: {checker.explain(q).text()}")
+    callbacks(checker)
+    queries(checker)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A saved scene keeps the view and the truth apart, and both exact."""
+
+import filecmp
+
+import numpy as np
+import pytest
+
+from vprism_plan.errors import ObservationError
+from vprism_plan.perception import load_observation
+from vprism_plan.simulation import load_ground_truth, random_scene, save_scene
+from vprism_plan.simulation.make_demo_scene import BUNDLED, main
+
+
+@pytest.mark.parametrize("name", ["scene", "scene.npz"])
+def test_round_trip(tmp_path, name):
+    scene = random_scene(4, 3, n_clutter=1)
+    save_scene(scene, tmp_path / name)
+    seen = load_observation(tmp_path / name)
+    np.testing.assert_allclose(seen.depth, scene.observation.depth, atol=1e-6)
+    np.testing.assert_array_equal(seen.labels, scene.observation.labels)
+    np.testing.assert_allclose(seen.T_world_camera, scene.camera.T_world_camera, atol=1e-12)
+    truth = load_ground_truth(tmp_path / name)
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (200, 3))
+    np.testing.assert_array_equal(truth.signed_distance(points), scene.signed_distance(points))
+    assert truth.observation.depth.tobytes() == scene.observation.depth.tobytes()
+
+
+def test_missing_truth_is_named(tmp_path):
+    with pytest.raises(ObservationError, match=r"ground_truth\.json does not exist"):
+        load_ground_truth(tmp_path)
+
+
+def test_bundled_scene_is_what_the_script_writes(tmp_path):
+    main(tmp_path / "again")
+    names = sorted(p.name for p in BUNDLED.iterdir())
+    assert "ground_truth.json" in names
+    assert "depth.png" in names
+    same, different, errors = filecmp.cmpfiles(BUNDLED, tmp_path / "again", names, shallow=False)
+    assert different == []
+    assert errors == []
+    assert sorted(same) == names

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Scenes on disk: what the camera saw, and beside it, apart, what is really there.
+
+`ground_truth.json` is never read by `load_observation`: nothing that plans sees it.
+"""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vprism_plan._files import read_json, reading, write_text
+from vprism_plan.errors import ObservationError
+from vprism_plan.simulation.camera import Camera, DepthNoise
+from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.solids import solid_from_dict
+
+_FORMAT = "vprism_plan scene, version 1"
+GROUND_TRUTH = "ground_truth.json"
+
+
+def scene_to_dict(scene: Scene) -> dict[str, Any]:
+    """Return everything that defines a scene, JSON-ready and exact."""
+    return {
+        "format": _FORMAT,
+        "name": scene.name,
+        "seed": scene.seed,
+        "labels": list(scene.labels),
+        "solids": [solid.to_dict() for solid in scene.solids],
+        "camera": {
+            "T_world_camera": scene.camera.T_world_camera.tolist(),
+            "intrinsics": scene.camera.intrinsics.tolist(),
+            "width": scene.camera.width,
+            "height": scene.camera.height,
+        },
+        "noise": None if scene.noise is None else asdict(scene.noise),
+    }
+
+
+def scene_from_dict(data: dict[str, Any]) -> Scene:
+    """Rebuild a scene; raises ObservationError for another format."""
+    if data.get("format") != _FORMAT:
+        raise ObservationError(
+            f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
+        )
+    camera = data["camera"]
+    return Scene(
+        tuple(solid_from_dict(solid) for solid in data["solids"]),
+        tuple(data["labels"]),
+        Camera(
+            np.asarray(camera["T_world_camera"], dtype=np.float64),
+            np.asarray(camera["intrinsics"], dtype=np.float64),
+            camera["width"],
+            camera["height"],
+        ),
+        None if data["noise"] is None else DepthNoise(**data["noise"]),
+        data["seed"],
+        data["name"],
+    )
+
+
+def save_scene(scene: Scene, path: str | Path) -> None:
+    """Write the observation (folder, or `.npz` by suffix) and the ground truth beside it.
+
+    For a folder the truth is `<folder>/ground_truth.json`, for `scene.npz` it is
+    `scene.ground_truth.json`.
+    """
+    from vprism_plan.perception import save_observation
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_observation(scene.observation, path)
+    write_text(_truth_path(path), json.dumps(scene_to_dict(scene), indent=1) + "\n")
+
+
+def load_ground_truth(path: str | Path) -> Scene:
+    """Return the scene that was saved at `path` (the same path as given to `save_scene`)."""
+    truth = _truth_path(Path(path))
+    if not truth.is_file():
+        raise ObservationError(f"{truth} does not exist; a scene is written by save_scene")
+    with reading(truth, "the truth of a scene", ObservationError):
+        return scene_from_dict(read_json(truth, ObservationError))
+
+
+def _truth_path(path: Path) -> Path:
+    if path.suffix == ".npz":
+        return path.with_name(f"{path.stem}.{GROUND_TRUTH}")
+    return path / GROUND_TRUTH
