@@ -44,14 +44,12 @@ JOBS = {"maps": compile_maps, "checks": compile_checks}
 
 
 def compiled() -> bool:
-    """Whether the cache beside every kernel file holds something no older than the file."""
+    """Whether the cache beside every kernel file holds something no older than any of them."""
+    files = [file for file in KERNELS.glob("*.py") if file.stem not in {"__init__", "jit"}]
+    newest = max(file.stat().st_mtime for file in files)
     return all(
-        any(
-            index.stat().st_mtime >= file.stat().st_mtime
-            for index in KERNELS.glob(f"__pycache__/{file.stem}.*.nbi")
-        )
-        for file in KERNELS.glob("*.py")
-        if file.stem != "__init__"
+        any(i.stat().st_mtime >= newest for i in KERNELS.glob(f"__pycache__/{file.stem}.*.nbi"))
+        for file in files
     )
 
 

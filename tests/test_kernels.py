@@ -1,4 +1,4 @@
-"""numba's on-disk cache: no calls across kernel files, and a place for it on any machine."""
+"""numba's on-disk cache: it notices edits of callees, and has a place on any machine."""
 
 import ast
 import os
@@ -30,9 +30,10 @@ def imported(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_kernel_files_import_nothing_of_ours(path):
-    ours = [pair for pair in imported(path) if pair[0].startswith("vprism_plan")]
-    assert set(ours) <= {("vprism_plan._kernels.jit", "njit")}
+def test_kernel_files_import_nothing_of_ours_but_kernels(path):
+    """The stamp of their cache is a digest of these files, and of no others."""
+    ours = [module for module, _ in imported(path) if module.startswith("vprism_plan")]
+    assert all(module.startswith("vprism_plan._kernels.") for module in ours)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -99,6 +100,40 @@ def test_a_read_only_package_without_a_home_keeps_its_code_among_the_temporary_f
     chosen = tmp_path / "chosen"
     assert ask(tmp_path, {**settings, "NUMBA_CACHE_DIR": str(chosen)}) == ["42", str(chosen), "0"]
     assert list(chosen.rglob("added.twice*"))
+
+
+CALLER = """
+from vprism_plan._kernels.jit import njit
+from vprism_plan._kernels.added import twice
+
+@njit(cache=True, nogil=True)
+def twice_and_one(x):
+    return twice(x) + 1
+"""
+CALL = """
+from vprism_plan._kernels import caller
+print(caller.twice_and_one(21), sum(caller.twice_and_one.stats.cache_hits.values()))
+"""
+
+
+def test_an_edited_callee_is_compiled_into_its_callers(tmp_path):
+    """numba's own cache served the old code: it looks at the caller's file alone."""
+    kernels = tmp_path / "vprism_plan" / "_kernels"
+    kernels.mkdir(parents=True)
+    (kernels.parent / "__init__.py").touch()
+    (kernels / "__init__.py").touch()
+    shutil.copy(FOLDER / "jit.py", kernels)
+    (kernels / "caller.py").write_text(CALLER)
+    found = []
+    for body in (ADDED, ADDED, ADDED.replace("2 * x", "3 * x")):
+        (kernels / "added.py").write_text(body)
+        found.append(
+            subprocess.run(
+                [sys.executable, "-c", CALL], cwd=tmp_path, text=True, capture_output=True,
+                check=True, env={**os.environ, "PYTHONPATH": "."},
+            ).stdout.split()
+        )  # fmt: skip
+    assert found == [["43", "0"], ["43", "1"], ["64", "0"]]
 
 
 def test_where_nothing_can_be_written_kernels_are_compiled_without_a_cache(nowhere):

@@ -1,4 +1,4 @@
-"""What the README shows must run as it stands."""
+"""What the README, and the page of questions, show must run as it stands."""
 
 import re
 import subprocess
@@ -24,10 +24,11 @@ def test_the_python_example_runs_and_plans(repository):
 
 
 @pytest.mark.slow
-def test_what_the_readme_shows_of_risk_contacts_and_margins_runs_after_the_first_example(
+def test_what_is_shown_of_risk_contacts_and_margins_runs_after_the_first_example(
     repository,
 ):
-    first, second, _, fourth = blocks((repository / "README.md").read_text(), "python")
+    first, _, fourth = blocks((repository / "README.md").read_text(), "python")
+    (second,) = blocks((repository / "docs" / "questions.md").read_text(), "python")
     done = subprocess.run(
         [sys.executable, "-c", first + second + fourth],
         cwd=repository, capture_output=True, text=True, check=False,
@@ -39,13 +40,17 @@ def test_what_the_readme_shows_of_risk_contacts_and_margins_runs_after_the_first
 
 
 def test_the_ompl_lines_are_those_of_the_example(repository):
-    shown = blocks((repository / "README.md").read_text(), "python")[2]
+    shown = blocks((repository / "README.md").read_text(), "python")[1]
     program = (repository / "examples" / "02_your_own_ompl_program.py").read_text()
     lines = [line.split("#")[0].strip() for line in shown.splitlines() if line.strip()]
     assert len(lines) <= 10
     for line in lines:
         if line.startswith("si.") or "getSpaceInformation" in line:
             assert line in program
+
+
+def test_it_is_read_in_three_minutes(repository):
+    assert len((repository / "README.md").read_text().splitlines()) <= 110
 
 
 def test_links_lead_somewhere(repository):
@@ -55,7 +60,7 @@ def test_links_lead_somewhere(repository):
 
 
 def test_measured_numbers_name_commands_that_exist(repository):
-    text = (repository / "README.md").read_text()
+    text = (repository / "docs" / "results" / "measured.md").read_text()
     commands = re.findall(r"`python -m experiments\.benchmarks\.([a-z_]+)", text)
     assert len(commands) >= 4
     for command in commands:

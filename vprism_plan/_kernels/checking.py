@@ -3,19 +3,9 @@
 
 A robot and a world reach these kernels as a few packed arrays, because every array
 argument costs a call about 60 ns and the whole state check takes about one
-microsecond. `vprism_plan.collision._packing` documents and fills the layouts:
+microsecond. `vprism_plan.collision._packing` fills them:
 
-robot floats `rf`, robot integers `ri`:
-    ri[0:8]   = n_frames, n_spheres, n_links, n_pairs, dof, 0, 0, 0
-    ri[8:16]  = offsets into ri of: frame ints (parent, kind, q index), link ints
-                (frame, first sphere, end sphere, rule), pairs (a, b), continuous flags
-    ri[16:24] = offsets into rf of: frame floats (R 9, t 3, multiplier, offset), spheres
-                (all x, all y, all z, all radii), link bounding spheres (x, y, z,
-                radius), limits (lower, upper), reach table (n_frames, n_links), self margin
-                and, per pair, the padding of both links, which their gap does not count
-
-Frame 0 is the base; every other frame moves about or along its own z axis. A link's
-rule says which of the fields it is checked against; -1: none (it stands on the world).
+the robot `rf`, `ri`: see `vprism_plan._kernels.robot`.
 
 world floats `wf` = origin x, y, z, spacing, outside_occupied, n_planes, margin, then
     four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset); then, where
@@ -27,6 +17,12 @@ block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 
 import numpy as np
 
 from vprism_plan._kernels.jit import njit
+from vprism_plan._kernels.robot import (  # noqa: F401
+    fk_frames,
+    place_link,
+    place_spheres,
+    place_spheres_batch,
+)
 
 _INF = np.inf
 # Radians or metres: what turns or slides farther is refused. Up to here angles are good to a
@@ -34,78 +30,6 @@ _INF = np.inf
 FARTHEST = 1e6
 _MOST_CHECKS = 1_000_000  # configurations of one edge, seconds; an edge of so many is refused
 _MAX_TURN = 0.5  # radians per step of a sampled path: keeps the bend between samples small
-
-
-@njit(cache=True, nogil=True, inline="always")
-def fk_frames(q, rf, ri, T):
-    """Fill T (n_frames, 12) with the world pose of every frame: R row-major, then t."""
-    n_frames = ri[0]
-    fi = ri[8]
-    ff = ri[16]
-    for k in range(12):
-        T[0, k] = rf[ff + k]
-    for i in range(1, n_frames):
-        p = ri[fi + 3 * i]
-        kind = ri[fi + 3 * i + 1]
-        o = ff + 14 * i
-        value = rf[o + 12] * q[ri[fi + 3 * i + 2]] + rf[o + 13]
-        ox = rf[o + 9]
-        oy = rf[o + 10]
-        oz = rf[o + 11]
-        if kind == 1:
-            s = np.sin(value)
-            c = np.cos(value)
-        else:
-            s = 0.0
-            c = 1.0
-        for r in range(3):
-            a = T[p, 3 * r]
-            b = T[p, 3 * r + 1]
-            d = T[p, 3 * r + 2]
-            x = a * rf[o] + b * rf[o + 3] + d * rf[o + 6]
-            y = a * rf[o + 1] + b * rf[o + 4] + d * rf[o + 7]
-            z = a * rf[o + 2] + b * rf[o + 5] + d * rf[o + 8]
-            T[i, 3 * r] = c * x + s * y
-            T[i, 3 * r + 1] = c * y - s * x
-            T[i, 3 * r + 2] = z
-            t = T[p, 9 + r] + a * ox + b * oy + d * oz
-            if kind == 2:
-                t += z * value
-            T[i, 9 + r] = t
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _place_link(link, T, rf, ri, C):
-    """Fill the columns of C (3, n_spheres) that hold a link's world sphere centres."""
-    li = ri[9] + 4 * link
-    f = ri[li]
-    n = ri[1]
-    xo = ri[17]
-    yo = xo + n
-    zo = yo + n
-    for row in range(3):
-        a = T[f, 3 * row]
-        b = T[f, 3 * row + 1]
-        c = T[f, 3 * row + 2]
-        t = T[f, 9 + row]
-        for s in range(ri[li + 1], ri[li + 2]):
-            C[row, s] = a * rf[xo + s] + b * rf[yo + s] + c * rf[zo + s] + t
-
-
-@njit(cache=True, nogil=True)
-def place_spheres(q, rf, ri, C):
-    """Fill C (3, n_spheres) with world sphere centres: the kinematics twin."""
-    T = np.empty((ri[0], 12))
-    fk_frames(q, rf, ri, T)
-    for link in range(ri[2]):
-        _place_link(link, T, rf, ri, C)
-
-
-@njit(cache=True, nogil=True)
-def place_spheres_batch(Q, rf, ri, C):
-    """Fill C (n, 3, n_spheres) for configurations Q (n, dof)."""
-    for n in range(Q.shape[0]):
-        place_spheres(Q[n], rf, ri, C[n])
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -296,7 +220,7 @@ def _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
             continue
         if not placed[link]:
             placed[link] = True
-            _place_link(link, T, rf, ri, C)
+            place_link(link, T, rf, ri, C)
         for s in range(ri[li + 1], ri[li + 2]):
             x = C[0, s]
             y = C[1, s]
@@ -327,7 +251,7 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, enough):
         return min(plane_all, field_all)
     if not placed[link]:
         placed[link] = True
-        _place_link(link, T, rf, ri, C)
+        place_link(link, T, rf, ri, C)
     best = _INF
     li = ri[9] + 4 * link
     ro = ri[17] + 3 * ri[1]
@@ -347,10 +271,10 @@ def _place_pair(a, b, T, C, placed, rf, ri):
     """Make sure that the spheres of both links are placed."""
     if not placed[a]:
         placed[a] = True
-        _place_link(a, T, rf, ri, C)
+        place_link(a, T, rf, ri, C)
     if not placed[b]:
         placed[b] = True
-        _place_link(b, T, rf, ri, C)
+        place_link(b, T, rf, ri, C)
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""`njit` for our kernels: numba's, and a place for its cache also where it knows none.
+"""`njit` for our kernels: numba's, whose cache notices edits of callees, and has a place anywhere.
+
+numba compiles a cached function again when its own file has changed, not when a file has that it
+calls into. So the stamp of ours is a digest of all kernel files: they may call one another.
 
 numba keeps compiled code in NUMBA_CACHE_DIR, else beside the source, else in the user's cache
 folder, and refuses to define a function if it can write to none of them, as in a read-only
@@ -8,6 +11,7 @@ and without one the code is compiled anew in every process.
 """
 
 import functools
+import hashlib
 import os
 import stat
 import tempfile
@@ -25,7 +29,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         try:
-            return numba.njit(**options)(function)
+            return _stamped(numba.njit(**options)(function))
         except RuntimeError:  # "cannot cache function": raised where it is defined, not compiled
             folder = own_temporary_folder()
         if folder is None:
@@ -33,11 +37,23 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         before = _settings.CACHE_DIR
         _settings.CACHE_DIR = str(folder)  # read while a function is defined, and only then
         try:
-            return numba.njit(**options)(function)
+            return _stamped(numba.njit(**options)(function))
         finally:
             _settings.CACHE_DIR = before
 
     return compiled
+
+
+def _stamped(dispatcher: Any) -> Any:
+    """Make cached code depend on all kernel files."""
+    dispatcher._cache._cache_file._source_stamp = _digest()
+    return dispatcher
+
+
+@functools.cache
+def _digest() -> str:
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 @functools.cache

@@ -5,44 +5,17 @@ Quicker and coarser than the kernels that verdicts rest on (`risk`), and never m
 objective is asked about hundreds of motions where a checker is asked about one. Most of a
 motion is far from anything uncertain and is passed over in strides.
 
-The robot (`rf`, `ri`) is packed as in `vprism_plan._kernels.checking`, the draws' tables are
-those of `vprism_plan._kernels.risk`. Kernels must not import each other (a cached one would
-not notice that the other changed), so the few lines of kinematics are here once more.
+The robot (`rf`, `ri`) is packed as in `vprism_plan._kernels.robot`, the draws' tables are those of
+`vprism_plan._kernels.risk`.
 """
 
 import numpy as np
 
 from vprism_plan._kernels.jit import njit
+from vprism_plan._kernels.risk import UNBAKED, mark_ball
+from vprism_plan._kernels.robot import fk_frames
 
-UNBAKED = np.int32(-1)  # as in `risk`
 _MAX_TURN = 0.5  # radians per step, as in `checking`
-
-
-@njit(cache=True, nogil=True)
-def _frames(q, rf, ri, T):
-    """Fill T (n_frames, 12) with the world pose of every frame: R row-major, then t."""
-    fi = ri[8]
-    for k in range(12):
-        T[0, k] = rf[ri[16] + k]
-    for i in range(1, ri[0]):
-        p = ri[fi + 3 * i]
-        kind = ri[fi + 3 * i + 1]
-        o = ri[16] + 14 * i
-        value = rf[o + 12] * q[ri[fi + 3 * i + 2]] + rf[o + 13]
-        s = np.sin(value) if kind == 1 else 0.0
-        c = np.cos(value) if kind == 1 else 1.0
-        for r in range(3):
-            a = T[p, 3 * r]
-            b = T[p, 3 * r + 1]
-            d = T[p, 3 * r + 2]
-            x = a * rf[o] + b * rf[o + 3] + d * rf[o + 6]
-            y = a * rf[o + 1] + b * rf[o + 4] + d * rf[o + 7]
-            z = a * rf[o + 2] + b * rf[o + 5] + d * rf[o + 8]
-            T[i, 3 * r] = c * x + s * y
-            T[i, 3 * r + 1] = c * y - s * x
-            T[i, 3 * r + 2] = z
-            t = T[p, 9 + r] + a * rf[o + 9] + b * rf[o + 10] + d * rf[o + 11]
-            T[i, 9 + r] = t + z * value if kind == 2 else t
 
 
 @njit(cache=True, nogil=True)
@@ -139,16 +112,6 @@ def _bound_ball(gx, gy, gz, need, distance_row, table, rows, lowest, scale, reac
 
 
 @njit(cache=True, nogil=True)
-def _mark(gx, gy, gz, wide, table, wanted):
-    """Mark the blocks of 16^3 voxels that a box around g reaches."""
-    _, bx, by, bz = wanted.shape
-    for i in range(max(int(gx - wide) // 16, 0), min(int(gx + wide) // 16 + 1, bx)):
-        for j in range(max(int(gy - wide) // 16, 0), min(int(gy + wide) // 16 + 1, by)):
-            for k in range(max(int(gz - wide) // 16, 0), min(int(gz + wide) // 16 + 1, bz)):
-                wanted[table, i, j, k] = True
-
-
-@njit(cache=True, nogil=True)
 def _read_field(gx, gy, gz, ball, field, corner, directions, peak):
     """Mean, or largest, value of a field at some points of a ball (voxels), 0 outside it."""
     nx, ny, nz = field.shape
@@ -189,7 +152,7 @@ def sweep_draws(
     while k <= steps:
         for j in range(ri[4]):
             q[j] = qa[j] + (k / parts) * delta[j]
-        _frames(q, rf, ri, T)
+        fk_frames(q, rf, ri, T)
         here[:] = 0
         stride = parts + 1.0
         for link in range(ri[2]):
@@ -228,10 +191,9 @@ def sweep_draws(
                     )  # fmt: skip
                     if found < 0:
                         missing += 1
-                        _mark(
-                            gx - first[0], gy - first[1], gz - first[2], need + 2.0, tables[s],
-                            wanted,
-                        )  # fmt: skip
+                        mark_ball(
+                            gx - first[0], gy - first[1], gz - first[2], need, tables[s], wanted
+                        )
             if clear <= 0.0:
                 stride = 0.0
             elif clear * spacing < stride * step:
@@ -266,7 +228,7 @@ def sweep_field(
     while k <= steps:
         for j in range(ri[4]):
             q[j] = qa[j] + (k / parts) * delta[j]
-        _frames(q, rf, ri, T)
+        fk_frames(q, rf, ri, T)
         total = 0.0
         stride = parts + 1.0
         for link in range(ri[2]):

@@ -240,7 +240,7 @@ def _touch_ball(
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _mark_ball(gx, gy, gz, ball, table, wanted):
+def mark_ball(gx, gy, gz, ball, table, wanted):
     """Mark the blocks that a ball, and the cell around its centre, reach."""
     _, bx, by, bz = wanted.shape
     wide = ball + 2.0
@@ -289,7 +289,7 @@ def touch(
                     here[s] |= hit[s]
             elif found == _UNKNOWN:
                 missing += 1
-                _mark_ball(gx, gy, gz, ball, tables[j], wanted)
+                mark_ball(gx, gy, gz, ball, tables[j], wanted)
         counts[i] = 0
         if some:
             total = 0
@@ -356,7 +356,7 @@ def touch_each(
                 out[i, s] = hit[s] != 0
         elif found == _UNKNOWN:
             missing += 1
-            _mark_ball(gx, gy, gz, radii[i] / spacing, table, wanted)
+            mark_ball(gx, gy, gz, radii[i] / spacing, table, wanted)
     return missing
 
 

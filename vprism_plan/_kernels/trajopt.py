@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compiled costs of trajectories with their gradients, on the CPU.
 
-Robots are packed as `vprism_plan.collision._packing.pack_robot` does (layout in
-`vprism_plan._kernels.checking`). Every kernel walks over the samples of a trajectory, places
-the spheres, turns the slope of the cost at each sphere's centre into a force, and the forces
-into joint gradients: moments about the joints' axes, summed from the leaves to the base.
-`vprism_plan.trajopt` has the same in plain torch; the tests compare the two.
+Robots are packed as in `vprism_plan._kernels.robot`. Every kernel walks over the samples of a
+trajectory, places the spheres, turns the slope of the cost at each sphere's centre into a force,
+and the forces into joint gradients: moments about the joints' axes, summed from the leaves to the
+base. `vprism_plan.trajopt` has the same in plain torch; the tests compare the two.
 """
 
 import math
@@ -13,42 +12,16 @@ import math
 import numpy as np
 
 from vprism_plan._kernels.jit import njit
+from vprism_plan._kernels.robot import fk_frames, place_link
 
 _SHORT = 1e-6  # metres; as in vprism_plan.trajopt._samples
 
 
 @njit(cache=True, nogil=True)
 def _frames(q, rf, ri, T, L):
-    """Fill T (frames, 12) with frame poses (R row-major, t), L (links, 3) with the centres of
-    the balls around the links."""
-    fi = ri[8]
-    ff = ri[16]
-    for k in range(12):
-        T[0, k] = rf[ff + k]
-    for i in range(1, ri[0]):
-        p = ri[fi + 3 * i]
-        kind = ri[fi + 3 * i + 1]
-        o = ff + 14 * i
-        value = rf[o + 12] * q[ri[fi + 3 * i + 2]] + rf[o + 13]
-        s = 0.0
-        c = 1.0
-        if kind == 1:
-            s = math.sin(value)
-            c = math.cos(value)
-        for r in range(3):
-            a = T[p, 3 * r]
-            b = T[p, 3 * r + 1]
-            d = T[p, 3 * r + 2]
-            x = a * rf[o] + b * rf[o + 3] + d * rf[o + 6]
-            y = a * rf[o + 1] + b * rf[o + 4] + d * rf[o + 7]
-            z = a * rf[o + 2] + b * rf[o + 5] + d * rf[o + 8]
-            T[i, 3 * r] = c * x + s * y
-            T[i, 3 * r + 1] = c * y - s * x
-            T[i, 3 * r + 2] = z
-            t = T[p, 9 + r] + a * rf[o + 9] + b * rf[o + 10] + d * rf[o + 11]
-            if kind == 2:
-                t += z * value
-            T[i, 9 + r] = t
+    """Fill T (frames, 12) with frame poses, L (links, 3) with the centres of the balls around
+    the links."""
+    fk_frames(q, rf, ri, T)
     for link in range(ri[2]):
         f = ri[ri[9] + 4 * link]
         o = ri[18] + 4 * link
@@ -59,27 +32,11 @@ def _frames(q, rf, ri, T, L):
 
 
 @njit(cache=True, nogil=True)
-def _place_link(link, T, rf, ri, C):
-    """Fill the columns of C (3, spheres) that hold the centres of a link's spheres."""
-    n = ri[1]
-    xo = ri[17]
-    li = ri[9] + 4 * link
-    f = ri[li]
-    for row in range(3):
-        a = T[f, 3 * row]
-        b = T[f, 3 * row + 1]
-        c = T[f, 3 * row + 2]
-        t = T[f, 9 + row]
-        for s in range(ri[li + 1], ri[li + 2]):
-            C[row, s] = a * rf[xo + s] + b * rf[xo + n + s] + c * rf[xo + 2 * n + s] + t
-
-
-@njit(cache=True, nogil=True)
 def _place(q, rf, ri, T, L, C):
     """Place frames, links and all spheres."""
     _frames(q, rf, ri, T, L)
     for link in range(ri[2]):
-        _place_link(link, T, rf, ri, C)
+        place_link(link, T, rf, ri, C)
 
 
 @njit(cache=True, nogil=True)
@@ -380,7 +337,7 @@ def _obstacle_terms(T, L, C, placed, rf, ri, V, E, wf, radii, grown, slope, valu
             continue
         active[link] = True
         if not placed:
-            _place_link(link, T, rf, ri, C)
+            place_link(link, T, rf, ri, C)
         for s in range(ri[li + 1], ri[li + 2]):
             value[s] = 0.0
             G[0, s] = 0.0
@@ -635,7 +592,7 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
         for link in (a, b):
             if not active[link]:
                 active[link] = True
-                _place_link(link, T, rf, ri, C)
+                place_link(link, T, rf, ri, C)
                 for s in range(ri[ri[9] + 4 * link + 1], ri[ri[9] + 4 * link + 2]):
                     F[0, s] = 0.0
                     F[1, s] = 0.0
