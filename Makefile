@@ -9,17 +9,26 @@ TORCH_INDEX ?=
 EXTRAS ?= dev,experiments,docs,viewer
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint types docs bench clean
+.PHONY: demo test test-all lint types docs bench clean
+COMMA := ,
 
 demo: $(STAMP)
 	$(BIN)/vprism-plan demo --output out/demo
 
 # A worker keeps to its half of the tests, and with it to the fixtures it has made, until the
 # other half is left over.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal --durations=40
+
 test: $(STAMP)
 	$(BIN)/python tests/compile_kernels.py
-	$(BIN)/python -m pytest --cov --cov-report=term:skip-covered --durations=40 -n 2 \
-		--dist worksteal
+	$(PYTEST) -m "not slow"
+
+# Everything, with coverage and with types checked at run time: twice the work.
+TYPED := perception,mapping,world,robots,collision,planning,trajopt
+test-all: $(STAMP)
+	$(BIN)/python tests/compile_kernels.py
+	$(PYTEST) --cov --cov-report=term:skip-covered \
+		--jaxtyping-packages=$(subst $(COMMA),$(COMMA)vprism_plan.,vprism_plan.$(TYPED)),beartype.beartype
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -26,6 +26,13 @@ settings.register_profile(
 settings.load_profile("repeatable")
 
 
+def pytest_collection_modifyitems(items):
+    """What only measures, and what only draws, is for the long run."""
+    for item in items:
+        if item.path.parent.name in {"experiments", "viz"}:
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _one_torch_thread():
     import torch

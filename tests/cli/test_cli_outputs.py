@@ -181,6 +181,7 @@ def test_bases_stand_beside_the_objects_and_face_them(demo_map, repository):
         assert pose[2, 3] == pytest.approx(0.0, abs=0.005)
 
 
+@pytest.mark.slow
 def test_demo_writes_what_it_names_and_keeps_clear_of_the_truth(tmp_path, capsys):
     code = main(["demo", "--output", str(tmp_path / "demo"), "--json"])
     report = json.loads(capsys.readouterr().out)

@@ -64,6 +64,7 @@ def test_the_table_lists_the_nearest_pairs_first(ask):
     assert all(len(line) <= 100 for line in rows)
 
 
+@pytest.mark.slow
 def test_json_says_what_the_library_says(ask, saved_map, repository):
     code, out = ask("--q", *FREE, "--json")
     assert code == 0
@@ -83,6 +84,7 @@ def test_json_says_what_the_library_says(ask, saved_map, repository):
     assert set(report["timings"]) >= {"bake", "check", "margins", "risk"}
 
 
+@pytest.mark.slow
 def test_a_refusal_names_reasons_risk_and_what_may_be_touched(ask):
     code, out = ask("--q", *BLOCKED)
     assert code == 1

@@ -395,6 +395,7 @@ def test_spheres_that_touch_a_mesh_are_never_free_for_the_field(seed, ball_robot
         assert set(compare(checker, meshes, Q[::20]).counts()) <= {"voxel inflation"}
 
 
+@pytest.mark.slow
 def test_a_panda_in_the_demo_scene(demo_world, repository):
     """Solids within enclosing spheres: what the field accepts, no surface contradicts."""
     base = np.eye(4)

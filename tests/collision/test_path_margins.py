@@ -191,6 +191,7 @@ def test_nonsense_is_refused_by_name(ball_robot):
         min_clearance(checker, np.zeros((0, 3)))
 
 
+@pytest.mark.slow
 def test_with_a_bound_on_risk_motion_stops_where_the_verdict_does(demo_map, demo_world, ball_robot):
     seen, labels = demo_map.views[0].points()
     middle = seen[labels == 3].mean(axis=0)

@@ -485,6 +485,7 @@ def test_bounds_hold_the_size_of_voxels_and_the_skipped_ones_errors(ball, drawn,
         assert estimate.lower == pytest.approx(max(0.0, lower[centres] - worlds.error_occupied))
 
 
+@pytest.mark.slow
 def test_intervals_hold_what_finer_voxels_find(small, ball, doubtful):
     """Of 48 paths at contact three had a risk above their upper bound by voxels of 2 mm: 0.69
     where 0.434 was stated."""
@@ -701,6 +702,7 @@ def test_edges_are_free_if_their_joint_risk_is_within_the_bound(bounded, doubtfu
     assert seen == {(True, False), (False, True), (False, False)}
 
 
+@pytest.mark.slow
 def test_a_tightened_checker_refuses_more_and_says_why(bounded, doubtful):
     """Its reports once counted with the looser bound, and failed where that was not reached."""
     rng = np.random.default_rng(8)

@@ -72,6 +72,7 @@ def test_effect_of_the_cutoff_is_bounded(make, seed):
     assert np.abs(answers[0] - answers[1]).max() < 2e-3
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 10**6),
@@ -180,6 +181,7 @@ def test_longer_steps_never_lower_the_bound(make, seed, classes, scale):
     assert (np.diff(history) >= -1e-9 * np.abs(history[1:])).all()
 
 
+@pytest.mark.slow
 def test_longer_steps_reach_the_same_posterior_sooner(make):
     """Both climb to one optimum; six long steps get farther than ten plain ones."""
     problem = make(2, 4, n=60, hinges=15)

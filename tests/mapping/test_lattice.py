@@ -7,6 +7,7 @@ from experiments.lattice import ball_scene, shift_lattice
 from vprism_plan.mapping import MapConfig
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "seed", "touching", "passing", "n_worlds"),
     [

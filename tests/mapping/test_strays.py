@@ -1,6 +1,7 @@
 """Flying pixels must not become objects in the air, and real surfaces must stay."""
 
 import numpy as np
+import pytest
 
 import vprism_plan as vp
 from vprism_plan.mapping.strays import stray_points
@@ -36,6 +37,7 @@ def test_share_zero_keeps_everything_and_coarse_images_are_not_emptied():
     assert stray_points(np.zeros((0, 3)), 0.03).shape == (0,)
 
 
+@pytest.mark.slow
 def test_objects_behind_flying_pixels_come_out_in_one_piece():
     scene = demo_scene()
     meshes = vp.extract_meshes(vp.fit_map(scene.observation))

@@ -127,6 +127,7 @@ def test_500_cycles_grow_less_than_5_megabytes_and_leave_quietly(body):
     assert float(done.stdout) < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", [WITH_RISK, LED], ids=["own_program", "plan"])
 def test_objectives_keep_nothing_alive(body):
     done = run(PROLOGUE, body, EPILOGUE, cycles=60)

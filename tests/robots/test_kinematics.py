@@ -76,6 +76,7 @@ def test_all_implementations_agree_on_the_shipped_robots(robots, urdf_folder, na
     np.testing.assert_allclose(single.numpy(), plain, atol=5e-6)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(seed=seeds, n_links=st.integers(2, 9))
 def test_random_robots_agree_with_the_textbook(tmp_path_factory, seed, n_links):

@@ -191,6 +191,7 @@ def test_padding_leaves_self_collision_as_it_was(demo_world, robots):
     )
 
 
+@pytest.mark.slow
 def test_the_second_opinion_pads_links_against_the_world_alone(demo_world, robots):
     """Whatever the field accepts of a padded robot, FCL does, with spheres and with solids."""
     pose = np.eye(4)

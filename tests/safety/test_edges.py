@@ -56,6 +56,7 @@ def around(path, close):
     return path[index]
 
 
+@pytest.mark.slow
 def test_two_thousand_accepted_edges_touch_nothing(checker, level_set):
     edges = accepted_edges(checker, 2000)
     robot = checker.robot

@@ -186,6 +186,7 @@ def examine(checker, oracle, Q):
     return kinds
 
 
+@pytest.mark.slow
 def test_reasons_of_an_arm_are_confirmed(demo_world, oracle, repository):
     checker = vp.CollisionChecker(demo_world, arm(repository))
     rng = np.random.default_rng(0)

@@ -38,6 +38,11 @@ def ball(tmp_path_factory) -> vp.Robot:
     return vp.Robot.from_urdf(path, spheres=spheres)
 
 
+def slow(value):
+    """A parameter for the long run alone."""
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 def observed(kind: str, seed: int) -> vp.Observation:
     """Five things near the middle and a post 0.9 m away; of them labelled what `kind` says."""
     rng = np.random.default_rng(seed)
@@ -80,15 +85,14 @@ def seen_points(view: vp.Observation, seed: int) -> np.ndarray:
     return points[chosen]
 
 
-@pytest.fixture(scope="module", params=["labelled", "unlabelled", "mixed"])
+@pytest.fixture(scope="module", params=["mixed", slow("labelled"), slow("unlabelled")])
 def fitted(request):
     view = observed(request.param, seed=len(request.param))
     return vp.fit_map(view), seen_points(view, 0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("bounds", [None, SMALL], ids=["default grid", "small grid"])
-@pytest.mark.parametrize("occluded", ["occupied", "posterior", "free"])
+@pytest.mark.parametrize("bounds", [SMALL, slow(None)], ids=["small grid", "default grid"])
+@pytest.mark.parametrize("occluded", ["posterior", slow("occupied"), slow("free")])
 def test_no_ball_on_a_seen_point_is_accepted(fitted, ball, occluded, bounds):
     map_, points = fitted
     resolution = 0.01 if bounds else 0.015
@@ -102,7 +106,7 @@ def test_no_ball_on_a_seen_point_is_accepted(fitted, ball, occluded, bounds):
         assert checker.clearance(points[0]) <= 0.0
 
 
-@pytest.mark.parametrize("kind", ["labelled", "unlabelled"])
+@pytest.mark.parametrize("kind", ["unlabelled", slow("labelled")])
 def test_what_was_seen_outside_the_grid_has_a_name_and_no_clearance(kind, ball):
     view = observed(kind, seed=3)
     world = vp.World(vp.fit_map(view), vp.WorldConfig(occluded="free", bounds=SMALL))
@@ -125,6 +129,7 @@ def test_what_was_seen_outside_the_grid_has_a_name_and_no_clearance(kind, ball):
     assert vp.CollisionChecker(wary, ball).clearance(free) > 0.3 - 2 * 0.1 * np.sqrt(3.0) - 0.02
 
 
+@pytest.mark.slow
 def test_farther_than_was_judged_is_refused_and_says_so(ball):
     world = vp.World(vp.fit_map(observed("labelled", seed=3)), vp.WorldConfig(bounds=SMALL))
     checker = vp.CollisionChecker(world, ball)

@@ -66,6 +66,7 @@ def risk(checker, path):
     return risk_figure(checker, path, height=0.12, resolution=0.01, title="sweep")
 
 
+@pytest.mark.slow
 def test_the_risk_picture_shows_map_sweep_and_curves(checker, path, risk):
     picture = pixels(risk)
     for color in (START_COLOR, GOAL_COLOR, HAND_COLOR):

@@ -1,6 +1,7 @@
 """A part too thin for the map's kernels was still seen, so it must stop the robot."""
 
 import numpy as np
+import pytest
 
 import vprism_plan as vp
 from vprism_plan.simulation.camera import Camera, DepthNoise
@@ -37,6 +38,7 @@ def test_a_thin_bar_that_was_seen_is_an_obstacle_even_where_the_map_says_free():
     assert (world.field.lower_bound(on_bar) <= 0.0).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_flying_pixels_are_no_forgotten_surfaces():
     from vprism_plan.simulation.scenes import demo_scene
 
