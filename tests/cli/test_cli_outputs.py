@@ -8,7 +8,6 @@ import pytest
 
 import vprism_plan as vp
 from vprism_plan.cli import main
-from vprism_plan.cli._commands import Plan
 from vprism_plan.cli._console import Console, dump_json
 from vprism_plan.cli._motions import pose_matrix
 from vprism_plan.cli._outcome import dense_path, true_distance
@@ -23,7 +22,7 @@ from vprism_plan.errors import PlanningError, VPrismError
     [
         ([], "no command"),
         (["fly"], "fly"),
-        (["map"], "PATH"),
+        (["map"], "VIEW"),
         (["map", "x.npz", "--seed", "many"], "many"),
         (["map", "x.npz", "--sede", "1"], "--sede"),
         (["plan", "x.npz", "--robot", "r.urdf", "--base-xyz", "1", "2"], "--base-xyz"),
@@ -43,9 +42,9 @@ def test_wrong_arguments_are_one_line(arguments, words, capsys):
 
 
 def test_negative_numbers_are_values():
-    command = parse(["plan", "m", "--robot", "r", "--start", "-1", "2.5", "-0.1", "--base-yaw=-1"])
-    assert isinstance(command, Plan)
-    assert command.start == (-1.0, 2.5, -0.1)
+    command = parse(["plan", "m", "--robot", "r", "--start", "-1e0", "2.5", "-.1", "--base-yaw=-1"])
+    assert command.command == "plan"
+    assert command.start == [-1.0, 2.5, -0.1]
     assert command.base_yaw == -1.0
 
 

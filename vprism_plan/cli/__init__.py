@@ -8,13 +8,19 @@ this program, with a traceback to report.
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 from vprism_plan.errors import VPrismError
 
 if TYPE_CHECKING:
-    from vprism_plan.cli._commands import Command
+    from vprism_plan.cli._parsing import Command
 
+# The file of each command; there `run_COMMAND(command, console)` returns the exit code.
+_FILES = {
+    "demo": "_demo", "map": "_maps", "mesh": "_maps", "plan": "_motions", "query": "_query",
+    "view": "_view", "robot": "_robot",
+}  # fmt: skip
 DONE, NO_SAFE_ANSWER, BAD_INPUT, DEFECT, INTERRUPTED = 0, 1, 2, 3, 130
 
 
@@ -42,10 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(command: "Command") -> int:
     """Run a command; what its input or its user can cause becomes an exit code."""
-    from vprism_plan.cli._dispatch import run
+    from vprism_plan.cli._console import Console
 
+    console = Console(as_json=command.json, strict=getattr(command, "strict", False))
+    file = import_module(f"vprism_plan.cli.{_FILES[command.command]}")
     try:
-        return run(command)
+        code: int = getattr(file, f"run_{command.command}")(command, console)
+        return code
     except BrokenPipeError:  # the reader of our output left early
         sys.stderr.close()
         return DONE

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vprism_plan._files import replacing
-from vprism_plan.cli._commands import Map, Mesh
 from vprism_plan.cli._console import Console
+from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._staging import MESH_FILES, staged
 from vprism_plan.errors import ObservationError
 
@@ -69,7 +69,7 @@ def describe_map(m: "VPrismMap") -> dict[str, Any]:
     }
 
 
-def run_map(command: Map, console: Console) -> int:
+def run_map(command: Command, console: Console) -> int:
     """Fit and save; exit code 0."""
     if command.output.is_dir():
         raise ObservationError(f"{command.output} is a folder; --output must name a file")
@@ -112,7 +112,7 @@ def write_meshes(m: "VPrismMap", folder: Path, level: float, resolution: float) 
     return meshes
 
 
-def run_mesh(command: Mesh, console: Console) -> int:
+def run_mesh(command: Command, console: Console) -> int:
     """Write the surfaces; exit code 0, or 1 if no object reaches the level."""
     from vprism_plan.mapping import load_map
 

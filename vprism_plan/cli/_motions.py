@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vprism_plan.cli._commands import Plan, Query, View
 from vprism_plan.cli._console import Console
 from vprism_plan.cli._maps import fit, observe
 from vprism_plan.cli._outcome import Situation, report_plan
+from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import (
     Surroundings,
     base_pose,
@@ -30,7 +30,7 @@ class NoPlaceError(Exception):
     """Nothing sensible was found for what the user left open: an answer, not bad input."""
 
 
-def run_plan(command: Plan, console: Console) -> int:
+def run_plan(command: Command, console: Console) -> int:
     """Plan and write the results; exit code 0, or 1 without a verified path."""
     from vprism_plan.robots import Robot
 
@@ -96,7 +96,7 @@ def _map_from(path: Path, frame: int | None, seed: int, console: Console) -> "VP
         return load_map(path)
 
 
-def bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
+def bake(m: "VPrismMap", command: Command, console: Console) -> "World":
     """Return the world with the policies that were asked for."""
     from vprism_plan.world import World, WorldConfig
 
@@ -107,7 +107,7 @@ def bake(m: "VPrismMap", command: Plan | Query, console: Console) -> "World":
     return world
 
 
-def checks(command: Plan | Query, robot: "Robot") -> "CheckerConfig":
+def checks(command: Command, robot: "Robot") -> "CheckerConfig":
     """Return what the checker is asked for; refuses bad values before the long work.
 
     Raises:
@@ -128,7 +128,7 @@ def checks(command: Plan | Query, robot: "Robot") -> "CheckerConfig":
     return CheckerConfig(margin=command.margin, max_risk=command.max_risk, allowed_contacts=allowed)
 
 
-def _check_lengths(command: Plan, robot: "Robot") -> None:
+def _check_lengths(command: Command, robot: "Robot") -> None:
     """Refuse malformed configurations before the long work.
 
     Raises:
@@ -161,9 +161,7 @@ def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
     return matrix
 
 
-def standing(
-    command: Plan | Query | View, robot: "Robot", world: "World", around: Surroundings
-) -> "Robot":
+def standing(command: Command, robot: "Robot", world: "World", around: Surroundings) -> "Robot":
     """Return the robot on the base that was given, else on the first free place."""
     if command.base_xyz is not None:
         return robot.with_base_pose(base_pose(np.array(command.base_xyz), around, command.base_yaw))
@@ -174,7 +172,7 @@ def standing(
     raise PlanningError("no free place for the base beside the objects; give --base-xyz")
 
 
-def _place(command: Plan, robot: "Robot", world: "World", config: "CheckerConfig") -> Situation:
+def _place(command: Command, robot: "Robot", world: "World", config: "CheckerConfig") -> Situation:
     """Return robot, checker, start and goal; what is open is chosen so that it is valid.
 
     Raises:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vprism_plan.cli._commands import Query
 from vprism_plan.cli._console import Console
 from vprism_plan.cli._motions import bake, checks, standing
+from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import Surroundings
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from vprism_plan.collision.entropy import PathEntropy
 
 
-def run_query(command: Query, console: Console) -> int:
+def run_query(command: Command, console: Console) -> int:
     """Answer for one configuration; exit code 0 if it is free, else 1."""
     from vprism_plan.collision import CollisionChecker
     from vprism_plan.mapping import load_map

@@ -5,8 +5,8 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-from vprism_plan.cli._commands import RobotInfo
 from vprism_plan.cli._console import Console
+from vprism_plan.cli._parsing import Command
 from vprism_plan.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _OFTEN = 0.3
 
 
-def run_robot(command: RobotInfo, console: Console) -> int:
+def run_robot(command: Command, console: Console) -> int:
     """Read a robot, compare its spheres with its geometry; write what was asked for."""
     from vprism_plan.robots import Robot, SphereFit
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vprism_plan._files import read_json, reading
-from vprism_plan.cli._commands import View
 from vprism_plan.cli._console import Console
 from vprism_plan.cli._motions import standing
+from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import Surroundings, base_pose
 from vprism_plan.errors import MapError, PlanningError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vprism_plan.robots import Robot
 
 
-def run_view(command: View, console: Console) -> int:
+def run_view(command: Command, console: Console) -> int:
     """Serve until interrupted; exit code 0.
 
     Raises:
@@ -105,14 +105,14 @@ def motion_of(folder: Path, plan: dict[str, Any] | None, robot: "Robot") -> "Tra
     return trajectory
 
 
-def _robot(command: View) -> "Robot | None":
+def _robot(command: Command) -> "Robot | None":
     from vprism_plan.robots import Robot
 
     return None if command.robot is None else Robot.from_urdf(command.robot)
 
 
 def _placed(
-    command: View, robot: "Robot", m: "VPrismMap", plan: dict[str, Any] | None, console: Console
+    command: Command, robot: "Robot", m: "VPrismMap", plan: dict[str, Any] | None, console: Console
 ) -> "Robot":
     """Return the robot where it is asked to stand, where it stood, or where it would stand."""
     around = Surroundings.of(m)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The demo: one bundled view, a map, a Panda that crosses the clutter it only half sees.
+"""The command `demo`: one bundled view, a map, a Panda that crosses the clutter it only half sees.
 
 The camera looks along +x; the arm stands at the side and moves its hand from the
 camera's side of the clutter to the far side, where short objects stand hidden behind
@@ -7,34 +7,31 @@ tall ones. The truth about the scene enters only the report and the pictures.
 """
 
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vprism_plan._resources import data_path, urdf_path
-
-if TYPE_CHECKING:
-    from vprism_plan.cli._console import Console
+from vprism_plan.cli._console import Console
+from vprism_plan.cli._maps import fit, observe
+from vprism_plan.cli._motions import choose_ends, solve
+from vprism_plan.cli._outcome import Situation
+from vprism_plan.cli._parsing import Command
+from vprism_plan.cli._placing import Surroundings, base_pose
 
 BASE_XYZ = (0.05, -0.6, 0.0)  # metres, beside the clutter
 BASE_YAW = np.pi / 2  # radians, facing it
 MARGIN = 0.005  # metres that every sphere keeps from all that may be occupied
 
 
-def run_demo(output: Path, seed: int, console: "Console") -> int:
-    """Fit, bake, plan, verify, and write everything to `output`; return the exit code."""
-    from vprism_plan.cli._maps import fit, observe
-    from vprism_plan.cli._motions import choose_ends, solve
-    from vprism_plan.cli._outcome import Situation
-    from vprism_plan.cli._placing import Surroundings, base_pose
+def run_demo(command: Command, console: Console) -> int:
+    """Fit, bake, plan, verify, and write everything; return the exit code."""
     from vprism_plan.collision import CheckerConfig, CollisionChecker
     from vprism_plan.errors import PlanningError
     from vprism_plan.robots import Robot
     from vprism_plan.simulation import load_ground_truth
     from vprism_plan.world import World
 
-    folder = data_path("demo_scene")
+    folder, seed = data_path("demo_scene"), command.seed
     obs = observe(folder, None, seed, console)
     m = fit(obs, seed, console)
     with console.stage("bake"):
@@ -58,6 +55,6 @@ def run_demo(output: Path, seed: int, console: "Console") -> int:
         planner="RRTConnect",
         time_limit=5.0,
         seed=seed,
-        output=output,
+        output=command.output,
         console=console,
     )
