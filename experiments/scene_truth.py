@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 
 from experiments.protocols import TrueScene
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.hinge_points import lattice_hinges
-from vprism_plan.mapping.negative_sampling import box_centers
+from vprism_plan.mapping.hinges import lattice_hinges
+from vprism_plan.mapping.training_data import box_centers
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.world import visibility

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.mapping import MapConfig, VPrismMap
-from vprism_plan.mapping.em import fit_weights
+from vprism_plan.mapping.em import fit_weights, weight_prior
 from vprism_plan.mapping.features import block_features
 from vprism_plan.mapping.fitting import learning_problem
-from vprism_plan.mapping.priors import weight_prior
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from experiments.baselines._common import checked_points, counts_per_voxel, one_hot
 from vprism_plan._kernels import rays
-from vprism_plan.mapping.strays import stray_points
+from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane

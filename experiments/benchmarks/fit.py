@@ -19,10 +19,9 @@ import torch
 
 from vprism_plan._threads import worker_count
 from vprism_plan.mapping import MapConfig
-from vprism_plan.mapping.em import fit_weights
+from vprism_plan.mapping.em import fit_weights, prior_means, weight_prior, weight_variances
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
 from vprism_plan.mapping.fitting import TrainingData, new_hinges, training_data
-from vprism_plan.mapping.priors import prior_means, weight_prior, weight_variances
 from vprism_plan.perception import fit_plane
 from vprism_plan.simulation.scenes import random_scene
 

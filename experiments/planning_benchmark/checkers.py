@@ -27,7 +27,7 @@ from experiments.protocols import TrueScene
 from vprism_plan._kernels import world as kernels
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.errors import ConfigError
-from vprism_plan.mapping.strays import stray_points
+from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception.camera import depth_sigma
 from vprism_plan.robots import Robot
 from vprism_plan.world import Grid, World, WorldConfig

@@ -33,7 +33,7 @@ from experiments.tables.intervals import estimate
 from experiments.tables.store import Case, require_writable
 from experiments.tables.sweep import sweep
 from vprism_plan.errors import ConfigError
-from vprism_plan.mapping.negative_sampling import box_centers
+from vprism_plan.mapping.training_data import box_centers
 from vprism_plan.perception.observation import Observation
 
 METHODS = ("sgd", "vprism", "vprism-paper")

@@ -282,7 +282,7 @@ def test_binary_maps_learn_from_the_same_points_in_the_same_features(fitted, obs
 
 def fit_binary(problem, config, k):
     """Dense EM of one object against everything else."""
-    from vprism_plan.mapping.priors import weight_prior
+    from vprism_plan.mapping.em import weight_prior
 
     prior = weight_prior(problem.space, config, 2)
     variance = 1.0 / prior.precision[problem.space.diagonal, 0]

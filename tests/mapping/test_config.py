@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from vprism_plan.errors import ConfigError
 from vprism_plan.mapping import MapConfig
+from vprism_plan.mapping.em import empty_logit, prior_means
 from vprism_plan.mapping.prediction import occupied_probability
-from vprism_plan.mapping.priors import empty_logit, prior_means
 
 
 def test_paper_holds_table_three():

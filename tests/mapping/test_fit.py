@@ -8,10 +8,10 @@ import pytest
 
 from vprism_plan.errors import MapError, ObservationError, PlaneNotFoundError
 from vprism_plan.mapping import MapConfig, fit_map
+from vprism_plan.mapping.em import expand_prior
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.fitting import training_data
 from vprism_plan.mapping.posterior import VPrismMap
-from vprism_plan.mapping.priors import expand_prior
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.simulation.scenes import random_scene
 

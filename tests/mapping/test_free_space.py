@@ -8,7 +8,7 @@ import pytest
 import vprism_plan as vp
 from vprism_plan.errors import ConfigError
 from vprism_plan.mapping.fitting import learning_problem
-from vprism_plan.mapping.free_space import needed_nodes
+from vprism_plan.mapping.hinges import needed_nodes
 from vprism_plan.perception.plane import Plane
 from vprism_plan.simulation import demo_scene, random_scene
 

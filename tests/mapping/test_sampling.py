@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vprism_plan.mapping import MapConfig
-from vprism_plan.mapping.hinge_points import lattice_hinges, surface_hinges
-from vprism_plan.mapping.negative_sampling import (
+from vprism_plan.mapping.hinges import lattice_hinges, surface_hinges
+from vprism_plan.mapping.training_data import (
     box_centers,
+    grid_subsample,
     sample_below_plane,
     sample_in_front,
     sample_rays,
 )
-from vprism_plan.mapping.subsampling import grid_subsample
 
 SEEDS = st.integers(0, 10**6)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import vprism_plan as vp
-from vprism_plan.mapping.strays import stray_points
+from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.simulation.scenes import demo_scene
 
 

@@ -11,16 +11,21 @@ from jaxtyping import Bool, Float, Int, Int64
 
 from vprism_plan._numbers import is_whole
 from vprism_plan.errors import MapError, ObservationError
-from vprism_plan.mapping import negative_sampling as negatives
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior, Prior, fit_weights
+from vprism_plan.mapping.em import Posterior, Prior, expand_prior, fit_weights, weight_prior
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
-from vprism_plan.mapping.free_space import needed_nodes
-from vprism_plan.mapping.hinge_points import lattice_hinges, surface_hinges
+from vprism_plan.mapping.hinges import lattice_hinges, needed_nodes, surface_hinges
 from vprism_plan.mapping.posterior import VPrismMap
-from vprism_plan.mapping.priors import expand_prior, weight_prior
-from vprism_plan.mapping.strays import stray_points
-from vprism_plan.mapping.subsampling import grid_subsample
+from vprism_plan.mapping.training_data import (
+    box_centers,
+    grid_subsample,
+    outside_boxes,
+    sample_below_plane,
+    sample_in_front,
+    sample_rays,
+    stray_points,
+    sunk_objects,
+)
 from vprism_plan.perception.masks import drop_background
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
@@ -194,29 +199,29 @@ def training_data(
     clouds = [_without_strays(*_marked_points(view), config.stray_share) for view in views]
     points = np.concatenate([cloud for cloud, _ in clouds])
     labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
-    lower, upper = negatives.box_centers(points, labels, object_ids, config.box_trim)
+    lower, upper = box_centers(points, labels, object_ids, config.box_trim)
     centers = 0.5 * (lower + upper)
     empty = [points[labels == 0]]
     front: list[np.ndarray] = []
     for view, (cloud, label) in zip(views, clouds, strict=True):
         origin = view.camera_center
         empty.append(
-            negatives.sample_rays(
+            sample_rays(
                 cloud, origin, centers, config.object_radius, config.ray_step, rng,
                 config.ray_sampling,
             )
         )  # fmt: skip
         if config.front_distance is not None:
-            seen = negatives.sample_in_front(cloud[label > 0], origin, config.front_distance)
+            seen = sample_in_front(cloud[label > 0], origin, config.front_distance)
             front.append(grid_subsample(seen, config.front_resolution))
-    below = negatives.sample_below_plane(
+    below = sample_below_plane(
         plane.normal, plane.offset, centers, config.object_radius,
         config.below_plane_samples, rng, config.below_plane_margin,
     )  # fmt: skip
-    sunk = negatives.sunk_objects(points, labels, object_ids, plane.normal, plane.offset)
+    sunk = sunk_objects(points, labels, object_ids, plane.normal, plane.offset)
     # What lies lower than the plane has a hidden side of its own: nobody denies that.
     room = config.object_radius
-    empty.append(below[negatives.outside_boxes(below, lower[sunk], upper[sunk], room)])
+    empty.append(below[outside_boxes(below, lower[sunk], upper[sunk], room)])
     near = np.concatenate(empty)
     if config.ray_sampling != "whole":
         near = _near_any(near, centers, config.object_radius)
@@ -282,7 +287,7 @@ def new_hinges(
             lattice, views, plane, data.surface, config.hinge_spacing, config.hinge_reach
         )
         lower, upper = data.lower[data.sunk], data.upper[data.sunk]
-        needed |= ~negatives.outside_boxes(lattice, lower, upper, config.hinge_margin)
+        needed |= ~outside_boxes(lattice, lower, upper, config.hinge_margin)
         lattice = lattice[needed]
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
     hinges = np.concatenate([lattice, surface])

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
-from vprism_plan.mapping.strays import stray_points
+from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import height_sigma
 from vprism_plan.world.grid import Grid

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
-from vprism_plan.mapping.strays import BLOCK, points_around
+from vprism_plan.mapping.training_data import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import depth_sigma, height_sigma

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from vprism_plan.errors import ObservationError
-from vprism_plan.mapping.subsampling import grid_subsample
+from vprism_plan.mapping.training_data import grid_subsample
 from vprism_plan.perception.plane import Plane
 
 CONTEXT = 3  # numbers beside the cloud: log scale, height of the centre, elevation

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Object-centric negative samples (section V of the paper): where nothing is.
+"""What a map is learned from: object-centric negative samples (section V of the paper), where
+nothing is; subsampling; and flying pixels, points between a depth edge and what lies behind it.
 
-All functions take points in the world frame, metres, and draw from the generator
-they are given.
+All functions take points in the world frame, metres, and draw from the generator they are given.
 """
+
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan._kernels import mapping as kernels
+from vprism_plan.errors import MapError
 from vprism_plan.mapping.config import RaySampling
 
 
@@ -120,3 +123,68 @@ def sample_in_front(
     length = np.linalg.norm(rays, axis=1)
     far = length > distance
     return points[far] - rays[far] * (distance / length[far])[:, None]
+
+
+def grid_subsample(
+    points: Float[np.ndarray, "n 3"], resolution: float | None
+) -> Float[np.ndarray, "m 3"]:
+    """Return the barycentre of the points in each occupied cell of `resolution` (m).
+
+    Cells sit at world multiples of the resolution; the result is ordered by cell, so
+    it does not depend on the order of the points but for rounding in the sums. A
+    resolution of None keeps every point.
+    """
+    if len(points) == 0 or resolution is None:
+        return points.copy()
+    cells = np.floor(points / resolution)
+    lower = cells.min(axis=0)
+    extent = cells.max(axis=0) - lower + 1.0
+    if extent.prod() >= 2.0**62:
+        raise MapError(
+            f"the points span {extent[0]:.3g} x {extent[1]:.3g} x {extent[2]:.3g} cells of "
+            f"{resolution} m; check the depth unit (metres)"
+        )
+    index = (cells - lower).astype(np.int64)
+    shape = extent.astype(np.int64)
+    key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+    order = np.argsort(key, kind="stable")
+    sorted_key = key[order]
+    start = np.flatnonzero(np.concatenate(([True], sorted_key[1:] != sorted_key[:-1])))
+    count = np.diff(np.append(start, len(points)))
+    return np.add.reduceat(points[order], start, axis=0) / count[:, None]
+
+
+_CELL = 0.01  # metres; a point's surroundings are its cell and the 26 around it
+BLOCK = 3.0 * _CELL
+
+
+def stray_points(points: Float[np.ndarray, "n 3"], share: float) -> Bool[np.ndarray, " n"]:
+    """Return which points of one object stand almost alone.
+
+    A depth camera reports points in the air behind an object's outline. They are few
+    and spread along the rays, so the 3 cm block around one holds far fewer points than
+    around a point of a surface: less than `share` of the object's median.
+
+    Args:
+        points: one object's observed points, m, at the image's resolution.
+        share: of the median; 0 calls nothing stray.
+    """
+    if share <= 0.0 or len(points) == 0:
+        return np.zeros(len(points), dtype=bool)
+    density = points_around(points)
+    return density < share * np.median(density)
+
+
+def points_around(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Return how many of the points (m) lie in the `BLOCK` wide block around each."""
+    cells, inverse, counts = np.unique(
+        np.floor(points / _CELL).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    index = {
+        tuple(cell): count for cell, count in zip(cells.tolist(), counts.tolist(), strict=True)
+    }
+    around = np.zeros(len(cells), dtype=np.int64)
+    for shift in product((-1, 0, 1), repeat=3):
+        near = (cells + np.array(shift)).tolist()
+        around += np.array([index.get(tuple(cell), 0) for cell in near], dtype=np.int64)
+    return around[inverse.reshape(-1)]
