@@ -9,8 +9,7 @@ from jaxtyping import Float
 from experiments.protocols import Reconstruction
 from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.world.config import check_level
-from vprism_plan.world.meshes import surface
-from vprism_plan.world.sampling import check_spacing, sample_box
+from vprism_plan.world.meshes import check_spacing, sample_box, surface
 
 if TYPE_CHECKING:
     import trimesh

@@ -35,7 +35,7 @@ from vprism_plan.trajopt import (
     SmoothnessCost,
     TrajectoryCost,
 )
-from vprism_plan.trajopt._samples import Subdivision, sample_paths
+from vprism_plan.trajopt.cost import Subdivision, sample_paths
 
 ROOT = Path(__file__).resolve().parents[2]
 SPACING = 0.05  # metres between samples: the costs' default

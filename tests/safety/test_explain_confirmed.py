@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 import vprism_plan as vp
 from vprism_plan.world.known import Box, Cylinder, HalfSpace
-from vprism_plan.world.lost_depth import lost_cones
+from vprism_plan.world.seen import lost_cones
 
 VOXEL = 0.01
 FINE = 0.004  # of the oracle's own lattices

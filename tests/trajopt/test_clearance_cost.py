@@ -13,7 +13,7 @@ from oracles.small_scenes import at
 import vprism_plan as vp
 from vprism_plan.trajopt import ClearanceCost
 from vprism_plan.trajopt._field import SplineField, grown, union_field
-from vprism_plan.trajopt._potential import hinge
+from vprism_plan.trajopt.sphere_costs import hinge
 from vprism_plan.world.distance import Lattice, NodeDistances, distance_to_lattice, finish
 from vprism_plan.world.grid import Grid
 

@@ -8,7 +8,7 @@ from oracles.checker_oracle import sphere_positions
 
 from vprism_plan.errors import RobotError
 from vprism_plan.trajopt import JointLimitCost, PoseCost, SelfCollisionCost, SmoothnessCost
-from vprism_plan.trajopt._potential import hinge, soft_contact
+from vprism_plan.trajopt.sphere_costs import hinge, soft_contact
 
 
 def curve(T, dof=3, dtype=torch.float64):

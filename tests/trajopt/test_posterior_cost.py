@@ -8,7 +8,7 @@ from oracles.risk_oracle import DrawnVoxels, ball_touches
 
 import vprism_plan as vp
 from vprism_plan.trajopt import EntropyCost, OccupancyCost, RiskCost
-from vprism_plan.trajopt._map_field import ball_quadrature
+from vprism_plan.trajopt.posterior_costs import ball_quadrature
 
 RADIUS = 0.03
 SUPPORT = 0.5  # kernel mass from which readings count, of a map alone

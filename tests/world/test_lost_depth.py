@@ -11,7 +11,7 @@ from oracles.world_oracles import KernelMap
 
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.world import World, WorldConfig
-from vprism_plan.world.lost_depth import lost_cones, lost_objects
+from vprism_plan.world.seen import lost_cones, lost_objects
 
 K = intrinsics()
 TABLE = Plane((0.0, 0.0, 1.0), 0.0)

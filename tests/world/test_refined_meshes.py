@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from vprism_plan.errors import ConfigError
 from vprism_plan.world import extract_meshes
 from vprism_plan.world.levelset import lattice_refinement, trace_level_set
-from vprism_plan.world.refined_meshes import extract_refined_meshes
+from vprism_plan.world.meshes import extract_refined_meshes
 
 LEVELS = [0.5, 0.2, 0.8]
 

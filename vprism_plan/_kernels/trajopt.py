@@ -14,7 +14,7 @@ import numpy as np
 from vprism_plan._kernels.jit import njit
 from vprism_plan._kernels.robot import fk_frames, place_link
 
-_SHORT = 1e-6  # metres; as in vprism_plan.trajopt._samples
+_SHORT = 1e-6  # metres; as in vprism_plan.trajopt.cost
 
 
 @njit(cache=True, nogil=True)

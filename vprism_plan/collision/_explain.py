@@ -11,7 +11,7 @@ from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.collision._bodies import kind_of
 from vprism_plan.collision.protocols import Answers, BakedWorld, NodeField, RuledWorld
 from vprism_plan.collision.reports import Contact, Kind, StateReport
-from vprism_plan.world.pictured import free_balls
+from vprism_plan.world.visibility import free_balls
 
 # Signed distance, metres; where, world; unit direction that leads out.
 Touch = tuple[Any, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]

@@ -11,8 +11,8 @@ from vprism_plan.collision._fcl import Shape
 from vprism_plan.collision.protocols import BakedWorld
 from vprism_plan.world.known import Box, Cylinder, KnownMesh, Sphere
 from vprism_plan.world.levelset import lattice_refinement
+from vprism_plan.world.meshes import extract_refined_meshes
 from vprism_plan.world.rasterize import winding_number
-from vprism_plan.world.refined_meshes import extract_refined_meshes
 from vprism_plan.world.support import RIM, SeenSupport, seen_support
 from vprism_plan.world.world import SUPPORT
 

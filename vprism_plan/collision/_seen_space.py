@@ -15,8 +15,7 @@ from vprism_plan.collision._solids import PlacedSolids
 from vprism_plan.collision.mesh_reports import SEEN
 from vprism_plan.robots._sphere_checks import drawn_points
 from vprism_plan.world import visibility
-from vprism_plan.world.lost_depth import lost_cones, lost_points
-from vprism_plan.world.seen_surfaces import surface_points
+from vprism_plan.world.seen import lost_cones, lost_points, surface_points
 
 _CELL = 0.03  # metres: one sample of a solid's surface per cube of this edge
 _DRAWN = 4000  # points per solid from which they are taken

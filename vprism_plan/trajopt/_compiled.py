@@ -13,7 +13,7 @@ from vprism_plan._kernels import trajopt as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.collision._packing import pack_robot
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.trajopt._samples import MAX_PARTS, MAX_TURN, Subdivision
+from vprism_plan.trajopt.cost import MAX_PARTS, MAX_TURN, Subdivision
 
 # (waypoints, change along each edge, parts of each edge, gradient to add to) -> cost
 Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], float]

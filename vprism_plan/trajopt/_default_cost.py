@@ -6,11 +6,10 @@ from typing import Any
 
 from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import PlanningError
-from vprism_plan.trajopt.clearance import ClearanceCost
 from vprism_plan.trajopt.cost import SumCost, TrajectoryCost
 from vprism_plan.trajopt.joint_costs import JointLimitCost, SmoothnessCost
 from vprism_plan.trajopt.risk_cost import RiskCost
-from vprism_plan.trajopt.self_collision import SelfCollisionCost
+from vprism_plan.trajopt.sphere_costs import ClearanceCost, SelfCollisionCost
 
 _MARGIN = 0.02  # metres beyond the checker's margin from which obstacles push
 _APART = 0.005  # the same of links from each other

@@ -1,25 +1,230 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The cost of colliding in worlds drawn from the posterior."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int, Int16
 from torch import Tensor
 
 from vprism_plan._kernels import trajopt as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import ConfigError
 from vprism_plan.trajopt._compiled import PathKernels, Pull, checked_backend, compiled
-from vprism_plan.trajopt._draw_field import draw_field
-from vprism_plan.trajopt._draw_torch import survival_losses
-from vprism_plan.trajopt._field import SplineField, grown, union_field
-from vprism_plan.trajopt._samples import Subdivision, require_dof
-from vprism_plan.trajopt._scene import map_and_scene
-from vprism_plan.trajopt._spheres import checked_spheres
-from vprism_plan.trajopt.cost import TrajectoryCost, at_least
+from vprism_plan.trajopt._field import SplineField, grown, spline_weights, union_field
+from vprism_plan.trajopt.cost import Subdivision, TrajectoryCost, at_least, require_dof
+from vprism_plan.trajopt.sphere_costs import checked_spheres, map_and_scene
 from vprism_plan.world import PosteriorWorlds
+from vprism_plan.world.distance import Lattice, NodeDistances, distance_to_lattice, finish
+from vprism_plan.world.grid import Grid
+
+_STEPS = 512.0  # stored per voxel: 64 voxels either way fit 16 bits
+_MOST = 2 << 30  # bytes
+_AROUND = 2.6  # steps from a point to the farthest node that its spline reads
+
+
+@dataclass(frozen=True, eq=False)
+class DrawField:
+    """Signed distance to the union of a draw's voxels and what is certain, for every draw.
+
+    A voxel that a draw occupies counts as the ball inscribed in it, as in `PosteriorWorlds`.
+    The nodes cover all that is nearer than `reach` to any voxel that any draw may occupy.
+    Distances are cut off so far beyond it that the spline is itself up to there.
+
+    Attributes:
+        steps: (rules, nx, ny, nz, S) int16: distance in multiples of `unit`, one table per
+            contact rule.
+        blocks: (rules, bx, by, bz) least distance of any draw in blocks of 4 x 4 x 4 cells.
+        grid: origin and spacing, metres.
+        unit: metres.
+        reach: metres.
+    """
+
+    steps: Int16[np.ndarray, "g nx ny nz s"]
+    blocks: Float32[np.ndarray, "g bx by bz"]
+    grid: Float[np.ndarray, " 4"]
+    unit: float
+    reach: float
+
+
+def draw_field(
+    worlds: PosteriorWorlds,
+    rules: Sequence[frozenset[int]],
+    certain: Sequence[Any],
+    planes: Float[np.ndarray, "p 4"],
+    reach: float,
+) -> DrawField:
+    """Bake the draws.
+
+    Args:
+        worlds: the draws.
+        rules: ids of objects that may be touched, one set per contact rule.
+        certain: distance field of what is an obstacle in every draw, per rule; empty if nothing.
+        planes: half-spaces.
+        reach: distances up to this are told apart, metres.
+
+    Raises:
+        ConfigError: that would take more than 2 GB, or `reach` is more than 57 voxels.
+    """
+    h = worlds.resolution
+    unit = h / _STEPS
+    row, _, first = worlds.owner_tables
+    possible = np.argwhere(row >= 0)
+    if len(possible) == 0:
+        possible = np.zeros((1, 3), dtype=np.int64)
+    whole = int(np.ceil(reach / h)) + 2
+    low = possible.min(axis=0) + first - whole
+    shape = tuple(int(n) for n in possible.max(axis=0) + first + whole + 1 - low)
+    if reach + _AROUND * h > 60.0 * h:
+        raise ConfigError(
+            f"contacts up to {reach:.3f} m matter, but {60.0 * h:.3f} m is as far as voxels of "
+            f"{h} m tell; lower the temperature, or use a coarser resolution"
+        )
+    size = 2 * len(rules) * int(np.prod(shape)) * worlds.n_worlds
+    if size > _MOST:
+        raise ConfigError(
+            f"n_worlds is {worlds.n_worlds}: {len(rules)} tables of {' x '.join(map(str, shape))} "
+            f"nodes would take {size / 2**30:.1f} GB (at most 2); use fewer worlds, or a coarser "
+            "resolution of the world"
+        )
+    grid = Grid(h, low, (shape[0], shape[1], shape[2]))
+    nodes = grid.slab(0, shape[0])
+    inner = tuple(slice(whole, n - whole) for n in shape)
+    index = np.moveaxis(np.indices([s.stop - s.start for s in inner]), 0, -1).reshape(-1, 3)
+    owners = worlds.owners(index + low + whole)
+    ids = [0, *worlds.map.object_ids]
+    steps = np.empty((len(rules), *shape, worlds.n_worlds), dtype=np.int16)
+    for g, gone in enumerate(rules):
+        counts = np.array([k > 0 and ids[k] not in gone for k in range(len(ids))])
+        floor = np.full(len(nodes), np.inf)
+        for plane in planes:
+            np.minimum(floor, nodes @ plane[:3] - plane[3], out=floor)
+        if certain:
+            np.minimum(floor, certain[g].lower_bound(nodes), out=floor)
+        fixed = np.maximum(floor, 0.0).astype(np.float32).reshape(shape)
+        for s in range(worlds.n_worlds):
+            marks = np.zeros(shape, dtype=np.uint8)
+            marks[inner] = counts[owners[:, s]].reshape(marks[inner].shape)
+            away, _ = distance_to_lattice(Lattice(marks, low, 1), grid)
+            away = np.minimum(np.maximum(away - np.float32(0.5 * h), 0.0), fixed)
+            none = np.zeros(shape, dtype=np.int16)
+            signed = finish(NodeDistances(away, none), grid, (), solid_outside=False).distance
+            steps[g, ..., s] = np.floor(np.clip(signed, -60.0 * h, reach + _AROUND * h) / unit)
+    lowest = steps.min(axis=4) * np.float32(unit)
+    return DrawField(steps, _block_least(lowest), np.array([*grid.origin, h]), unit, reach)
+
+
+def _block_least(
+    values: Float32[np.ndarray, "g nx ny nz"],
+) -> Float32[np.ndarray, "g bx by bz"]:
+    for axis, n in enumerate(values.shape[1:], start=1):
+        starts = 4 * np.arange((n - 1) // 4 + 1)[:, None]
+        # A point between nodes i and i + 1 hears of i - 1 to i + 2.
+        rows = np.clip(starts + np.arange(-1, 6), 0, n - 1)
+        values = np.take(values, rows, axis=axis).min(axis=axis + 1)
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+_AT_ONCE = 1 << 24  # numbers
+
+
+def survival_losses(
+    centers: Float[Tensor, "m s 3"],
+    trajectory: Int[Tensor, " m"],
+    count: int,
+    rules: Int[np.ndarray, " s"],
+    grown: Float[np.ndarray, " s"],
+    radii: Float[np.ndarray, " s"],
+    draws: DrawField,
+    certain: SplineField | None,
+    planes: Float[np.ndarray, "p 4"],
+    tau: float,
+    cut: float,
+) -> Float[Tensor, " b"]:
+    """Return -ln mean_s 1 / (1 + odds_s) of each trajectory; see `RiskCost`."""
+    n_worlds = draws.steps.shape[-1]
+    owners: list[Tensor] = []
+    depths: list[Tensor] = []
+    rows, columns = _near(centers.detach(), rules, grown + cut, draws)
+    table = torch.from_numpy(draws.steps.reshape(-1, n_worlds)).to(centers.device)
+    step = max(1, _AT_ONCE // (27 * n_worlds))
+    for start in range(0, len(rows), step):
+        i, s = rows[start : start + step], columns[start : start + step]
+        away = _distances(centers[i, s], rules[s.cpu().numpy()], draws, table)
+        owners.append(trajectory[i])
+        depths.append(torch.as_tensor(grown).to(centers)[s, None] - away)
+    if certain is not None:
+        gap = certain(centers, rules) - torch.as_tensor(grown).to(centers)
+        owners, depths = _with_common(owners, depths, -gap, trajectory, n_worlds)
+        for row in torch.as_tensor(planes).to(centers):
+            away = centers @ row[:3] - row[3] - torch.as_tensor(radii).to(centers)
+            owners, depths = _with_common(owners, depths, -away, trajectory, n_worlds)
+    if not owners:
+        return (0.0 * centers.sum()).expand(count)
+    owner, depth = torch.cat(owners), torch.cat(depths)
+    high = depth.new_zeros(count, n_worlds)
+    index = owner[:, None].expand(-1, n_worlds)
+    high = high.scatter_reduce(0, index, depth.detach() / tau, "amax", include_self=True)
+    soft = -torch.expm1(-(depth + cut).clamp(min=0.0) / tau)
+    grown_odds = torch.exp(depth / tau - high[owner]) * soft.square()
+    odds = torch.zeros_like(high).index_add(0, owner, grown_odds)
+    loss = high + torch.log(torch.exp(-high) + odds)
+    return -(torch.logsumexp(-loss, dim=1) - float(np.log(n_worlds)))
+
+
+def _with_common(
+    owners: list[Tensor],
+    depths: list[Tensor],
+    depth: Float[Tensor, "m s"],
+    trajectory: Int[Tensor, " m"],
+    n_worlds: int,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Add contacts that every draw has."""
+    flat = depth.reshape(-1, 1).expand(-1, n_worlds)
+    owner = trajectory[:, None].expand(depth.shape).reshape(-1)
+    return [*owners, owner], [*depths, flat]
+
+
+def _near(
+    centers: Float[Tensor, "m s 3"],
+    rules: Int[np.ndarray, " s"],
+    enough: Float[np.ndarray, " s"],
+    draws: DrawField,
+) -> tuple[Tensor, Tensor]:
+    """(sample, sphere) where a draw may be near enough to count."""
+    grid = torch.as_tensor(draws.grid).to(centers)
+    top = torch.tensor(draws.steps.shape[1:4], device=centers.device) - 1
+    scaled = (centers - grid[:3]) / grid[3]
+    inside = ((scaled >= 0.0) & (scaled <= top)).all(dim=-1)
+    rows, columns = inside.nonzero(as_tuple=True)
+    block = scaled[rows, columns].long() >> 2
+    blocks = torch.from_numpy(draws.blocks).to(centers)
+    own = torch.as_tensor(rules, device=centers.device)[columns]
+    least = blocks[own, block[:, 0], block[:, 1], block[:, 2]]
+    near = least < torch.as_tensor(enough).to(centers)[columns]
+    return rows[near], columns[near]
+
+
+def _distances(
+    points: Float[Tensor, "n 3"], rules: Int[np.ndarray, " n"], draws: DrawField, table: Any
+) -> Float[Tensor, "n d"]:
+    """Spline of every draw's signed distance, metres."""
+    grid = torch.as_tensor(draws.grid).to(points)
+    sizes = draws.steps.shape[1:4]
+    around, weights = spline_weights((points - grid[:3]) / grid[3], sizes)
+    first = torch.as_tensor(rules, device=points.device) * int(np.prod(sizes))
+    total = points.new_zeros(len(points), draws.steps.shape[-1])
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                row = (around[:, 0, i] * sizes[1] + around[:, 1, j]) * sizes[2] + around[:, 2, k]
+                share = weights[:, 0, i] * weights[:, 1, j] * weights[:, 2, k]
+                total = total + share[:, None] * (draws.unit * table[first + row].to(points))
+    return total
+
 
 _CUT = 8.0  # temperatures of clearance from which a contact does not count at all
 _ROOM = 3.0  # voxels between a sphere and the reach of the draws; see `PosteriorWorlds`

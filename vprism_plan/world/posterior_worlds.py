@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Int, Int32, UInt8
 from vprism_plan._kernels import risk as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
-from vprism_plan.world._draws import judge
-from vprism_plan.world._owners import Owners
+from vprism_plan.world._draws import Owners, judge
 from vprism_plan.world.distance import checked_points
 
 _MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels

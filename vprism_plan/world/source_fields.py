@@ -15,7 +15,7 @@ from vprism_plan.world.distance import (
     finish,
 )
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
-from vprism_plan.world.unseen import unmark
+from vprism_plan.world.marks import unmark
 from vprism_plan.world.world import SUPPORT, World
 
 

@@ -28,10 +28,7 @@ from vprism_plan.world.distance import (
 from vprism_plan.world.grid import Grid, choose_grid, grid_beyond
 from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
 from vprism_plan.world.levelset import lattice_refinement, trace_level_set
-from vprism_plan.world.posterior_worlds import PosteriorWorlds
-from vprism_plan.world.rasterize import rasterize_level_set, rasterize_mesh
-from vprism_plan.world.support import RIM, seen_support
-from vprism_plan.world.unseen import (
+from vprism_plan.world.marks import (
     BACKGROUND,
     CELLS,
     OCCLUDED,
@@ -39,6 +36,9 @@ from vprism_plan.world.unseen import (
     Evidence,
     unmark,
 )
+from vprism_plan.world.posterior_worlds import PosteriorWorlds
+from vprism_plan.world.rasterize import rasterize_level_set, rasterize_mesh
+from vprism_plan.world.support import RIM, seen_support
 
 _log = logging.getLogger(__name__)
 
@@ -180,7 +180,7 @@ class World:
         return NodeDistances(distance, source)
 
     def _sources_of_marks(self) -> np.ndarray:
-        """Index into `sources` of each mark of `world.unseen`, -1 for none, (256,)."""
+        """Index into `sources` of each mark of `world.marks`, -1 for none, (256,)."""
         classes = len(self.map.object_ids)
         first = self.sources.index("unobserved") + 1
         lost = len(self._evidence.without_depth)

@@ -14,8 +14,15 @@ from vprism_plan.world import visibility
 from vprism_plan.world.config import OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import Lattice
 from vprism_plan.world.grid import Grid
-from vprism_plan.world.lost_depth import Cone, lost_cones, lost_objects, lost_points
-from vprism_plan.world.seen_surfaces import Surface, off_level_set, surface_points
+from vprism_plan.world.seen import (
+    Cone,
+    Surface,
+    lost_cones,
+    lost_objects,
+    lost_points,
+    off_level_set,
+    surface_points,
+)
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
 # Marks on that lattice; where several apply the largest wins.
