@@ -4,7 +4,7 @@
 import math
 from collections.abc import Callable
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from vprism_plan._kernels import objectives as kernels
 from vprism_plan.errors import PlanningError
+from vprism_plan.planning.protocols import Configuration
 
-Kind = Literal["survival", "joint", "occupancy", "entropy"]
 KINDS: tuple[str, ...] = ("survival", "joint", "occupancy", "entropy")
 _OF_FIELDS = ("occupancy", "entropy")
 
@@ -35,26 +35,11 @@ class MotionRisk:
     stretches that are far from anything uncertain are skipped. All samples of a motion are
     worked through in one compiled call, and its cost is remembered.
 
-    The rates of a configuration q:
-        survival: -log(1 - p(q)), p the share of the checker's posterior worlds in which the
-            robot touches anything; a bound from above of the marginal that
-            `checker.collision_probability(q)` gives.
-        occupancy: sum over the spheres of the largest P(occupied) found in each; at voxels
-            about which the posterior worlds agree it counts as 0 or 1.
-        entropy: mean entropy, nats, of the map in the volume of the moving spheres. Only
-            where posterior worlds can differ; elsewhere the map is certain, or has no support.
-
-    The cost of a motion is the integral of the rate over the way of the sphere that moves
-    farthest (a bound on it, metres), by the trapezoidal rule. "joint" is not an integral but
-    -log(1 - p) with p the share of worlds in which the robot touches anything anywhere on
-    the motion, the same world for the whole motion; summed over a path's edges it bounds
-    -log(1 - risk) of the path if touching on one edge does not make touching on another
-    less likely.
-
-    Args:
-        checker: a `CollisionChecker` over a `World`.
-        kind: one of the above.
-        spacing: metres of sphere motion.
+    `VPrismRiskObjective` says what the kinds are. p of "survival" is a bound from above of the
+    marginal that `checker.collision_probability(q)` gives. Integrals are over the way of the
+    sphere that moves farthest (a bound on it, metres), by the trapezoidal rule. "joint",
+    summed over a path's edges, bounds -log(1 - risk) of the path if touching on one edge does
+    not make touching on another less likely.
 
     Raises:
         PlanningError: an unknown kind, a spacing out of range, or no posterior.
@@ -79,7 +64,11 @@ class MotionRisk:
         self._touched = np.zeros(worlds.n_worlds, np.uint8)
         if kind in _OF_FIELDS:
             self._field = _field(worlds, self._at.world, kind)
-            self._weights = _weights(self._at, kind)
+            # 1 per sphere of the moving links, or its share of their volume.
+            self._weights = (self._at.sphere_tables >= 0).astype(np.float64)
+            if kind == "entropy":
+                self._weights *= self._at.radii**3
+                self._weights /= max(float(self._weights.sum()), 1e-300)
             self._directions = _POINTS if kind == "occupancy" else 0.8 * _POINTS
         self._marks = worlds.new_marks()
         # Asked once without a sphere, so that nothing compiles inside a planner's time limit.
@@ -87,27 +76,26 @@ class MotionRisk:
         self._sweep(q, q)
         self._tables = self._at.sphere_tables
 
-    def motion(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+    def motion(self, qa: Configuration, qb: Configuration) -> float:
         """Return the cost of the straight motion between two configurations, either way."""
         a, b = qa.tobytes(), qb.tobytes()
-        key = (a, b) if a <= b else (b, a)
-        cost = self._kept.get(key)
+        if a > b:  # in one order, so that both directions cost the same to the last bit
+            a, b, qa, qb = b, a, qb, qa
+        cost = self._kept.get((a, b))
         if cost is None:
             if len(self._kept) >= _MOST_KEPT:
                 self._kept.clear()
-            # In one order, so that both directions cost the same to the last bit.
-            cost = self._cost(qa, qb) if a <= b else self._cost(qb, qa)
-            self._kept[key] = cost
+            cost = self._kept[a, b] = self._cost(qa, qb)
         return cost
 
-    def state(self, q: Float[np.ndarray, " dof"]) -> float:
+    def state(self, q: Configuration) -> float:
         """Return the rate at one configuration."""
         rates, touched, _ = self._sweep(q, q)
         if self.kind == "joint":
             return self._survival(touched)
         return float(self._as_rates(rates)[0])
 
-    def worst(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+    def worst(self, qa: Configuration, qb: Configuration) -> float:
         """Return the largest rate at the samples of the straight motion, either way."""
         if self.kind == "joint":
             return self.motion(qa, qb)
@@ -188,7 +176,10 @@ def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
 _baked: WeakKeyDictionary[Any, dict[str, tuple[np.ndarray, np.ndarray]]] = WeakKeyDictionary()
 
 
-def _possible(worlds: Any) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]:
+Grid = tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]  # values, first index
+
+
+def _possible(worlds: Any) -> Grid:
     """Distance, voxels, from voxel centres to the nearest that any draw may occupy; first index."""
     kept = _baked.setdefault(worlds, {})
     if "possible" not in kept:
@@ -208,9 +199,7 @@ def _possible(worlds: Any) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, 
     return kept["possible"]
 
 
-def _field(
-    worlds: Any, world: Any, kind: str
-) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]:
+def _field(worlds: Any, world: Any, kind: str) -> Grid:
     """P(occupied), or entropy in nats, at the voxel centres of the posterior worlds."""
     kept = _baked.setdefault(worlds, {})
     if kind not in kept:
@@ -228,12 +217,3 @@ def _field(
         field[tuple(drawn.T)] = np.where(values < _LEAST, 0.0, values)
         kept[kind] = field, first
     return kept[kind]
-
-
-def _weights(at: Any, kind: str) -> Float[np.ndarray, " s"]:
-    """1 per sphere of the moving links, or its share of their volume."""
-    weights = (at.sphere_tables >= 0).astype(np.float64)
-    if kind == "entropy":
-        weights *= at.radii**3
-        weights /= max(float(weights.sum()), 1e-300)
-    return weights

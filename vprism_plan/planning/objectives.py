@@ -15,13 +15,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._motion_risk import KINDS, MotionRisk, preparation
-from vprism_plan.planning._spaces import StateReader
-from vprism_plan.planning.ompl_adapter import nearest_turns
+from vprism_plan.planning.ompl_adapter import StateReader, nearest_turns
+from vprism_plan.planning.protocols import Configuration, Waypoints
 
 # Rates (n,) per metre at configurations (n, dof).
 Rates = Callable[[np.ndarray], np.ndarray]
@@ -52,8 +51,12 @@ class RiskObjective:
             raise PlanningError(
                 f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}, or a function"
             )
-        _require_weight(self.length_weight)
-        _require_spacing(self.spacing)
+        if not (math.isfinite(self.length_weight) and self.length_weight >= 0.0):
+            raise PlanningError(
+                f"length_weight is {self.length_weight!r}; it must be finite and at least 0"
+            )
+        if not (math.isfinite(self.spacing) and self.spacing > 0.0):
+            raise PlanningError(f"spacing is {self.spacing!r}; it must be finite and more than 0")
 
     @property
     def name(self) -> str:
@@ -73,37 +76,24 @@ class RiskObjective:
         return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
 
 
-def _require_weight(value: Any) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise PlanningError(f"length_weight is {value!r}; it must be finite and at least 0")
-
-
-def _require_spacing(value: Any) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise PlanningError(f"spacing is {value!r}; it must be finite and more than 0")
-
-
 class _FunctionRisk:
     """`MotionRisk` for rates that a user's function gives; "metres" are those of joint space."""
 
     def __init__(self, rates: Rates, spacing: float) -> None:
-        _require_spacing(spacing)
-        self.kind = "function"
-        self._rates = rates
-        self._spacing = spacing
+        self._rates, self._spacing = rates, spacing
 
-    def samples(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float]:
+    def _samples(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float]:
         """Return rates at equal steps of a motion, and its length."""
         way = float(np.linalg.norm(qb - qa))
         t = np.linspace(0.0, 1.0, max(1, math.ceil(way / self._spacing)) + 1)[:, None]
         return self._checked(qa + t * (qb - qa)), way
 
     def motion(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        values, way = self.samples(qa, qb)
+        values, way = self._samples(qa, qb)
         return way * float(np.mean(0.5 * (values[1:] + values[:-1])))
 
     def worst(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        return float(np.max(self.samples(qa, qb)[0]))
+        return float(np.max(self._samples(qa, qb)[0]))
 
     def state(self, q: np.ndarray) -> float:
         return float(self._checked(q[None])[0])
@@ -144,8 +134,8 @@ class PathCost:
         length_weight: float = 1e-3,
         worst: bool = False,
     ) -> None:
-        _require_weight(length_weight)
-        self.risk: Any = (
+        RiskObjective(kind, spacing, length_weight, worst)  # refuses what is out of range
+        self.risk: MotionRisk | _FunctionRisk = (
             MotionRisk(checker, kind, spacing)
             if isinstance(kind, str)
             else _FunctionRisk(kind, spacing)
@@ -154,14 +144,13 @@ class PathCost:
         self.worst = worst
         self._wraps = np.asarray(checker.robot.continuous, dtype=bool)
 
-    def edge(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+    def edge(self, qa: Configuration, qb: Configuration) -> float:
         """Return the cost of a straight motion; continuous joints turn as the difference says."""
         if self.worst:
             return float(self.risk.worst(qa, qb))
-        risk = float(self.risk.motion(qa, qb))
-        return risk + self.length_weight * space_distance(qa, qb, self._wraps)
+        return float(self.risk.motion(qa, qb)) + self.length_weight * self._distance(qb - qa)
 
-    def path(self, path: Float[np.ndarray, "t dof"]) -> float:
+    def path(self, path: Waypoints) -> float:
         """Return the cost of a path: the sum, or the largest, of its edges'."""
         return self.combined([self.edge(a, b) for a, b in pairwise(path)])
 
@@ -169,20 +158,17 @@ class PathCost:
         """Return what motions in a row cost together."""
         return max(costs, default=0.0) if self.worst else float(sum(costs))
 
-
-def space_distance(
-    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], wraps: Bool[np.ndarray, " dof"]
-) -> float:
-    """Length of a straight motion in `state_space`: Euclidean over each run of limited joints,
-    the angle for each continuous one, all summed."""
-    step = np.abs(qb - qa)
-    if not wraps.any():
-        return float(np.linalg.norm(step))
-    total = float(step[wraps].sum())
-    ends = np.flatnonzero(np.diff(np.concatenate([[True], wraps, [True]]).astype(int)))
-    for begin, end in zip(ends[::2], ends[1::2], strict=True):
-        total += float(np.linalg.norm(step[begin:end]))
-    return total
+    def _distance(self, step: Configuration) -> float:
+        """Length in `state_space`: Euclidean over each run of limited joints, the angle of each
+        continuous one, all summed."""
+        wraps, step = self._wraps, np.abs(step)
+        if not wraps.any():
+            return float(np.linalg.norm(step))
+        total = float(step[wraps].sum())
+        ends = np.flatnonzero(np.diff(np.concatenate([[True], wraps, [True]]).astype(int)))
+        for begin, end in zip(ends[::2], ends[1::2], strict=True):
+            total += float(np.linalg.norm(step[begin:end]))
+        return total
 
 
 class _RiskBase(ob.OptimizationObjective):
@@ -194,12 +180,11 @@ class _RiskBase(ob.OptimizationObjective):
         self._cost = cost
         self._reader = StateReader(space, checker.robot.dof)
         self._distance = space.distance
-        self._wraps = np.array(self._reader.wraps)
-        self._any_wraps = bool(self._wraps.any())
+        self._any_wraps = bool(self._reader.wraps.any())
 
     def _ends(self, s1: Any, s2: Any) -> tuple[np.ndarray, np.ndarray]:
         qa, qb = self._reader.read_pair(s1, s2)
-        return (qa, nearest_turns(qb, qa, self._wraps)) if self._any_wraps else (qa, qb)
+        return (qa, nearest_turns(qb, qa, self._reader.wraps)) if self._any_wraps else (qa, qb)
 
     def stateCost(self, state: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the rate at a state."""
