@@ -282,7 +282,7 @@ def test_the_search_gets_what_preparing_left(monkeypatch):
     monkeypatch.setattr(Prepared, "steps", [clock.step(t, done) for t in (0.5, 1.5)])
     limits = []
 
-    def searched(judge, query, report, lead, goal_index):
+    def searched(judge, query, report, lead):
         limits.append(query.request.time_limit)
         return not_found("timeout", None, report)
 

@@ -40,7 +40,7 @@ class Tip:
     chain: tuple[int, ...]
 
     def behind(self, R: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations and positions of the link, by those of all frames."""
+        """Rotations and positions (metres) of the link, by those of all frames, in the world."""
         turned = R[:, self.frame]
         return turned @ self.offset[:3, :3], turned @ self.offset[:3, 3] + t[:, self.frame]
 
@@ -60,7 +60,14 @@ def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
     two = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     links = [robot.link_poses(q) for q in two]
     R, t = frame_poses(robot.arrays, two)
-    name = _default_link(tuple(links[0])) if link is None else link
+    name = link
+    if link is None:
+        endings = [(n, e) for e in _TIP_NAMES for n in reversed(links[0])]
+        name = next((n for n, e in endings if n == e or n.endswith("_" + e)), None)
+    if name is None:
+        raise PlanningError(
+            "no link is recognisable as the end effector; name one (`link`): " + ", ".join(links[0])
+        )
     if name not in links[0]:
         raise PlanningError(
             f"{robot.name} has no link {name!r}; its links are {', '.join(links[0])}"
@@ -75,28 +82,11 @@ def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
     raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
 
 
-def _default_link(names: tuple[str, ...]) -> str:
-    for ending in _TIP_NAMES:
-        for name in reversed(names):
-            if name == ending or name.endswith("_" + ending):
-                return name
-    raise PlanningError(
-        "no link is recognisable as the end effector; name one (`link`): " + ", ".join(names)
-    )
-
-
 def _rigid_inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = R.T
     T[:3, 3] = -R.T @ t
     return T
-
-
-def tip_poses(
-    robot: Any, tip: Tip, q: Float[np.ndarray, "n dof"]
-) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Return rotations and positions (metres) of the link in the world."""
-    return tip.behind(*frame_poses(robot.arrays, q))
 
 
 def descend(

@@ -20,8 +20,6 @@ _OF_FIELDS = ("occupancy", "entropy")
 _PAD = 0.25  # metres around what is uncertain in which distances to it are known
 _LEAST = 1e-3  # probability, or nats, below which a field counts as 0
 _MOST_KEPT = 200_000  # motions whose cost is remembered
-
-
 # The middle of a ball, and its surface towards the faces and the corners of a cube.
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3.0)
@@ -90,40 +88,27 @@ class MotionRisk:
 
     def state(self, q: Configuration) -> float:
         """Return the rate at one configuration."""
-        rates, touched, _ = self._sweep(q, q)
-        if self.kind == "joint":
-            return self._survival(touched)
-        return float(self._as_rates(rates)[0])
+        rates, joint, _ = self._sweep(q, q)
+        return joint if self.kind == "joint" else float(rates[0])
 
     def worst(self, qa: Configuration, qb: Configuration) -> float:
         """Return the largest rate at the samples of the straight motion, either way."""
         if self.kind == "joint":
             return self.motion(qa, qb)
         a, b = (qa, qb) if qa.tobytes() <= qb.tobytes() else (qb, qa)
-        rates, _, _ = self._sweep(a, b)
-        return float(self._as_rates(rates).max())
+        return float(self._sweep(a, b)[0].max())
 
     def _cost(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        rates, touched, way = self._sweep(qa, qb)
+        rates, joint, way = self._sweep(qa, qb)
         if self.kind == "joint":
-            return self._survival(touched)
+            return joint
         if len(rates) == 1 or not rates.any():
             return 0.0
-        values = self._as_rates(rates)
-        mean = (values.sum() - 0.5 * (values[0] + values[-1])) / (len(values) - 1)
+        mean = (rates.sum() - 0.5 * (rates[0] + rates[-1])) / (len(rates) - 1)
         return float(way * mean)
 
-    def _as_rates(self, values: np.ndarray) -> np.ndarray:
-        if self.kind != "survival":
-            return values
-        p = np.minimum(values / len(self._touched), self._ceiling)
-        return -np.log1p(-p)
-
-    def _survival(self, touched: int) -> float:
-        return -math.log1p(-min(touched / len(self._touched), self._ceiling))
-
-    def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, int, float]:
-        """Values at the samples, worlds touched anywhere, bound on the way in metres."""
+    def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Rates at the samples, -log of the share of worlds touched nowhere, bound on the way."""
         at, worlds = self._at, self._at.worlds
         steps, way, turned = kernels.plan_steps(
             qa, qb, at.floats, at.ints, self.spacing, self._delta, self._rates
@@ -135,7 +120,7 @@ class MotionRisk:
                 self._possible, self._corner, worlds.resolution, self._field[0], self._field[1],
                 self._directions, self.kind == "occupancy", values,
             )  # fmt: skip
-            return values, 0, way
+            return values, 0.0, way
         counts = np.empty(steps + 1, np.int64)
         scale, reach = worlds.scale
         while True:
@@ -147,9 +132,12 @@ class MotionRisk:
                 counts, self._touched, self._marks,
             )  # fmt: skip
             if not missing:
-                return counts, int(self._touched.sum()), way
+                break
             worlds.bake_marked(self._marks)
             self._marks = worlds.new_marks()
+        n = len(self._touched)
+        joint = -math.log1p(-min(int(self._touched.sum()) / n, self._ceiling))
+        return -np.log1p(-np.minimum(counts / n, self._ceiling)), joint, way
 
 
 def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
@@ -172,11 +160,9 @@ def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
     return worlds, lambda: worlds().sample(), lambda: _possible(worlds())
 
 
-# Baking takes longer than many a search, so objectives over one map share it.
-_baked: WeakKeyDictionary[Any, dict[str, tuple[np.ndarray, np.ndarray]]] = WeakKeyDictionary()
-
-
 Grid = tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]  # values, first index
+# Baking takes longer than many a search, so objectives over one map share it.
+_baked: WeakKeyDictionary[Any, dict[str, Grid]] = WeakKeyDictionary()
 
 
 def _possible(worlds: Any) -> Grid:

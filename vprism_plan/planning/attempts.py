@@ -1,28 +1,31 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a query to a verified path: search, shorten, verify, and search again where that fails.
 
-Two things may fail. An edge that the search accepted may be refused when it is verified:
-then another seed is tried (`attempt`). And the whole path may be too risky although each of
-its edges is within the bound: then all is done again with a stricter one (`within_risk`).
+An edge that the search accepted may be refused when it is verified: then another seed is tried
+(`searched`). And the whole path may be too risky although each of its edges is within the
+bound: then all is done again with a stricter one (`within_risk`).
 """
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
 
 from vprism_plan.planning.objectives import PathCost
 from vprism_plan.planning.ompl_adapter import nearest_turns
-from vprism_plan.planning.path import MotionCheck, Now, cheapen, resample, shorten, verified
+from vprism_plan.planning.path import MotionCheck, cheapen, resample, shorten, verified
 from vprism_plan.planning.planners import planner_kind
-from vprism_plan.planning.protocols import CheckerLike, Waypoints
+from vprism_plan.planning.protocols import CheckerLike, Now, Waypoints
 from vprism_plan.planning.result import Improvement, PlanReport, PlanResult
 from vprism_plan.planning.search import MAX_SEED, SearchOutcome, SearchRequest, search
 
 # Plans with a checker within some seconds; the attempt's number makes its seed.
 Attempt = Callable[[CheckerLike, float, int], PlanResult]
+# The goal that a valid path leads to, and the path; it was not to be taken at once.
+Lead = tuple[int | None, np.ndarray]
 
 _SEARCHES = 5
 _LEAD_SHARE = 0.1  # of the time limit that shortening a leading path may take
@@ -44,30 +47,27 @@ def within_risk(
     max_risk = getattr(checker, "max_risk", None)
     if max_risk is None:
         return attempt(checker, time_limit, 0)
-    began = now()
+    began, spent = now(), 0.0
     best: PlanResult | None = None
-    level, tried, spent = 0, 0, 0.0
-    first: Any = checker
-    current = first
-    while current is not None:
-        left = time_limit - (now() - began - spent)
-        if level > 0 and left <= 0.0:
+    bounded: Any = checker
+    for level in count():
+        judge = bounded.tightened(level) if level else checker
+        left = time_limit - (now() - began - spent) if level else time_limit
+        if judge is None or (level and left <= 0.0):
             break
-        result, tried = attempt(current, left if level else time_limit, level), level
+        result, tried = attempt(judge, left, level), level
         if not result.solved:
             if best is None:
                 return result
             break
         asked = now()
-        risk = first.collision_probability(result.path, held_out=True)
+        risk = bounded.collision_probability(result.path, held_out=True)
         spent += now() - asked
         report = replace(result.report, risk=risk, risk_levels=level, risk_time=spent)
         if risk.upper <= max_risk:
             return replace(result, report=report, message=f"{result.message}; {risk.text()}")
         if best is None or risk.upper < best.report.risk.upper:
             best = replace(result, report=report)
-        level += 1
-        current = first.tightened(level)
     assert best is not None
     return replace(
         best,
@@ -108,11 +108,9 @@ class Query:
         if self.cost is not None:
             path = cheapen(path, check, report.seed, end, self.now, self.cost)
             path = shorten(path, check, report.seed, end, self.now, self.cost)
-        return path, replace(
-            report,
-            simplification_time=report.simplification_time + self.now() - began,
-            motion_checks=report.motion_checks + check.count,
-        )
+        took = report.simplification_time + self.now() - began
+        checks = report.motion_checks + check.count
+        return path, replace(report, simplification_time=took, motion_checks=checks)
 
     def verified(self, checker: CheckerLike, path: Waypoints, report: PlanReport) -> PlanResult:
         """Return the verdict on a path with the waypoints that were asked for."""
@@ -130,28 +128,27 @@ def attempt(
         return not_found("timeout", None, report)
     turns = np.asarray(checker.robot.continuous, dtype=bool)
     ends = nearest_turns(query.goals, query.start, turns)
-    index = next((k for k, q in enumerate(ends) if checker.check_motion(query.start, q)), None)
-    straight = None if index is None else np.stack([query.start, ends[index]])
+    straight = (
+        (index, np.stack([query.start, q]))
+        for index, q in enumerate(ends)
+        if checker.check_motion(query.start, q)
+    )
+    lead = next(straight, None)
     # Nothing is shorter. Only if it risks nothing, nothing is cheaper.
-    if straight is not None and (query.cost is None or query.cost.risk.motion(*straight) == 0.0):
-        return query.verified(checker, straight, replace(report, direct=True, goal_index=index))
+    if lead is not None and (query.cost is None or query.cost.risk.motion(*lead[1]) == 0.0):
+        return query.verified(checker, lead[1], replace(report, direct=True, goal_index=lead[0]))
     seed = _other_seed(query.request.seed, 64 * number)
     query = replace(query, request=replace(query.request, time_limit=time_limit, seed=seed))
-    return searched(checker, query, report, straight, index)
+    return searched(checker, query, report, lead)
 
 
 def searched(
-    checker: CheckerLike,
-    query: Query,
-    report: PlanReport,
-    lead: np.ndarray | None,
-    goal_index: int | None,
+    checker: CheckerLike, query: Query, report: PlanReport, lead: Lead | None
 ) -> PlanResult:
     """Search, shorten and verify; search again with another seed if verification fails.
 
     A checker that samples at its finest step can accept an edge in one direction and
-    refuse it in the other, by microns. Bidirectional planners turn edges round. `lead` is a
-    valid straight path to a goal, if there is one, that was not to be taken at once.
+    refuse it in the other, by microns. Bidirectional planners turn edges round.
     """
     refused: PlanResult | None = None
     for number in range(_SEARCHES):
@@ -160,7 +157,7 @@ def searched(
             break
         seed = _other_seed(query.request.seed, number)
         request = replace(query.request, seed=seed, time_limit=left)
-        found = _led(checker, query, request, lead, goal_index)
+        found = _led(checker, query, request, lead)
         report = replace(
             report,
             searches=number + 1,
@@ -181,11 +178,7 @@ def searched(
 
 
 def _led(
-    checker: CheckerLike,
-    query: Query,
-    request: SearchRequest,
-    lead: np.ndarray | None,
-    goal_index: int | None,
+    checker: CheckerLike, query: Query, request: SearchRequest, lead: Lead | None
 ) -> SearchOutcome:
     """Search, led along a known path if that is wanted: the given one, or RRTConnect's."""
     start, goals, cost, now = query.start, query.goals, query.cost, query.now
@@ -194,7 +187,7 @@ def _led(
         if found.status == "exact" or lead is None:
             return found
         # The planner failed; that a straight motion is valid was known before.
-        return replace(found, status="exact", path=lead, goal_index=goal_index)
+        return replace(found, status="exact", path=lead[1], goal_index=lead[0])
     spent, quick = 0.0, None
     if lead is None:
         first = replace(request, planner="RRTConnect", stop="first", step=None)
@@ -203,27 +196,27 @@ def _led(
             return quick
         began = now()
         end = began + _LEAD_SHARE * request.time_limit
-        lead = shorten(quick.path, MotionCheck(checker), request.seed, end, now)
-        goal_index = quick.goal_index
+        lead = quick.goal_index, shorten(quick.path, MotionCheck(checker), request.seed, end, now)
         spent = quick.planning_time + now() - began
         if request.time_limit - spent <= 0.0:
             return quick
     rest = replace(request, time_limit=request.time_limit - spent)
-    found = search(checker, start, goals, rest, cost, lead)
-    known = cost.path(lead)
+    goal_index, path = lead
+    found = search(checker, start, goals, rest, cost, path)
+    known = cost.path(path)
     whole = replace(
         found,
         planning_time=spent + found.planning_time,
         state_checks=found.state_checks + (quick.state_checks if quick else 0),
         motion_checks=found.motion_checks + (quick.motion_checks if quick else 0),
         history=(
-            Improvement(spent, known, lead),
+            Improvement(spent, known, path),
             *(replace(better, time=spent + better.time) for better in found.history),
         ),
     )
     if found.status == "exact" and found.path is not None and cost.path(found.path) <= known:
         return whole
-    return replace(whole, status="exact", path=lead, goal_index=goal_index)
+    return replace(whole, status="exact", path=path, goal_index=goal_index)
 
 
 def _other_seed(seed: int, number: int) -> int:
@@ -233,14 +226,8 @@ def _other_seed(seed: int, number: int) -> int:
 
 def not_found(status: str, path: np.ndarray | None, report: PlanReport) -> PlanResult:
     """Return what is answered where a search reached no goal."""
-    near = status == "approximate"
-    limit = f"within {report.time_limit:g} s"
-    return PlanResult(
-        path=None,
-        status="approximate" if near else "timeout",
-        report=report,
-        message=f"{report.planner} came near the goal but did not reach it {limit}"
-        if near
-        else f"{report.planner} found no path {limit}",
-        approximate_path=path if near else None,
-    )
+    who, limit = report.planner, f"within {report.time_limit:g} s"
+    if status != "approximate":
+        return PlanResult(None, "timeout", report, f"{who} found no path {limit}")
+    message = f"{who} came near the goal but did not reach it {limit}"
+    return PlanResult(None, "approximate", report, message, path)

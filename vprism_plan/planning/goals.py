@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import PlanningError, RobotError
-from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip, tip_poses
+from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip
 from vprism_plan.planning.ompl_adapter import nearest_turns
 from vprism_plan.planning.path import one_line
 from vprism_plan.planning.protocols import CheckerLike, Configuration
 from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
+from vprism_plan.robots._frames import frame_poses
 from vprism_plan.robots._values import joint_values
 
 _APART = 0.05  # solutions nearer to each other in every joint are one
@@ -27,12 +28,11 @@ class PoseGoalConfig:
     """How a pose, or a region, becomes configurations.
 
     Attributes:
-        link: the link that is to reach the pose; the end of the robot's longest chain
-            if None. A `ReachRegion` names its own.
+        link: that is to reach the pose; one named like an end effector ("tcp", "tool0",
+            "hand", ...) if None. A `ReachRegion` names its own.
         attempts: number of random configurations the solver starts from.
         iterations: steps per attempt.
-        position_tolerance: metres between the link and the pose that still count as
-            reached.
+        position_tolerance: metres between the link and the pose that count as reached.
         rotation_tolerance: radians likewise.
         max_goals: how many valid configurations are handed to the planner at most.
     """
@@ -170,34 +170,21 @@ class ReachRegion:
 
 @dataclass(frozen=True)
 class GoalSolutions:
-    """Configurations found for a pose or a region, of how many attempts.
+    """Configurations found for a pose or a region, of how many attempts."""
 
-    `reached` (n, dof) are distinct and nearest to the reference first, whether or not a
-    checker accepts them.
-    """
-
-    reached: np.ndarray
+    reached: np.ndarray  # (n, dof) distinct, nearest to the reference first, not yet checked
     attempts: int
 
 
 def solve_pose(
     robot: Any, pose: np.ndarray, reference: Configuration, seed: int, config: PoseGoalConfig
 ) -> GoalSolutions:
-    """Find configurations that bring a link to a pose.
+    """Find configurations that bring a link to a pose (4, 4) in the world, metres.
 
-    From random starts within the joint limits, in float64, with mimic and continuous joints.
-    (pytorch-kinematics' solver reads its offsets in float32 and leaves mimic joints out:
-    `experiments.benchmarks.inverse_kinematics`.)
-
-    Args:
-        robot: with `arrays` and `link_poses`.
-        pose: (4, 4) of the link in the world, metres.
-        reference: first start of the solver; solutions are sorted by their distance to it.
-        seed: of the random starts.
-        config: which link, tolerances, number of attempts.
-
-    Raises:
-        PlanningError: the pose is not a rigid transform, or the link is unknown.
+    From `reference`, and random starts within the joint limits, in float64, with mimic and
+    continuous joints. (pytorch-kinematics' solver reads its offsets in float32 and leaves mimic
+    joints out: `experiments.benchmarks.inverse_kinematics`.) Raises PlanningError if the pose
+    is not a rigid transform, or the link is unknown.
     """
     require_rigid(pose, "goal pose")
     n = config.attempts
@@ -213,7 +200,7 @@ def solve_region(
     """Find configurations that bring a link into a region; arguments as `solve_pose`."""
     n, link = config.attempts, region.link or config.link
     tip, q, _, _ = _descended(robot, link, lambda rng: region.draw(n, rng), reference, seed, config)
-    good = region.contains(*tip_poses(robot, tip, q))
+    good = region.contains(*tip.behind(*frame_poses(robot.arrays, q)))
     return GoalSolutions(_distinct(robot, q[good], reference), n)
 
 
@@ -261,9 +248,6 @@ def require_rigid(pose: np.ndarray, what: str) -> None:
             f"{what} {pose.tolist()} is not a rigid transform; it needs an orthonormal rotation "
             "with determinant 1, a translation in metres and the last row 0 0 0 1"
         )
-
-
-# --- what a query may begin and end with --------------------------------------------------
 
 
 def configuration(q: Any, robot: Any, what: str) -> Configuration:

@@ -34,9 +34,8 @@ class RiskObjective:
         kind: "joint", "survival", "occupancy", "entropy" or a function; see
             `VPrismRiskObjective`.
         spacing: metres of sphere motion between samples of a motion.
-        length_weight: cost of a unit of path length (the state space's distance, radians
-            and metres alike), beside the risk. It also is what informed sampling and
-            pruning work with: without it they have no bound to use.
+        length_weight: cost of a unit of path length (the state space's distance, radians and
+            metres alike), beside the risk; the bound that informed sampling and pruning use.
         worst: make the largest rate of any state on the path small in place of the sum
             (`VPrismMinimaxRiskObjective`); length then does not count.
     """
@@ -118,12 +117,8 @@ class _FunctionRisk:
 class PathCost:
     """What motions, and the paths they make up, cost by a risk objective; without OMPL.
 
-    Args:
-        checker: a `CollisionChecker` over a `World`; with a function anything with `robot`.
-        kind: of risk, or a function.
-        spacing: metres of sphere motion between samples.
-        length_weight: cost of a unit of length, see `VPrismRiskObjective`.
-        worst: whether the worst state counts alone.
+    `checker` is a `CollisionChecker` over a `World`, with a function anything with `robot`; the
+    other arguments are those of `RiskObjective`.
     """
 
     def __init__(
@@ -176,15 +171,13 @@ class _RiskBase(ob.OptimizationObjective):
 
     def __init__(self, si: Any, checker: Any, cost: PathCost) -> None:
         super().__init__(si)
-        space = si.getStateSpace()
         self._cost = cost
-        self._reader = StateReader(space, checker.robot.dof)
-        self._distance = space.distance
-        self._any_wraps = bool(self._reader.wraps.any())
+        self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
+        self._distance = si.getStateSpace().distance
 
     def _ends(self, s1: Any, s2: Any) -> tuple[np.ndarray, np.ndarray]:
         qa, qb = self._reader.read_pair(s1, s2)
-        return (qa, nearest_turns(qb, qa, self._reader.wraps)) if self._any_wraps else (qa, qb)
+        return qa, nearest_turns(qb, qa, self._reader.wraps)
 
     def stateCost(self, state: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the rate at a state."""
@@ -197,12 +190,12 @@ class VPrismRiskObjective(_RiskBase):
     cost(path) = sum over its motions of (risk of the motion + length_weight * length).
 
     Kinds of risk; p is a share of the checker's posterior worlds:
-        "joint": -log(1 - p), p that the motion touches anything, in the same world from its
-            beginning to its end. Closest to the risk of the whole path: the sum over the
-            path counts twice only what touches on two of its motions.
+        "joint": -log(1 - p), p that the motion touches anything, in the same world all along.
+            Closest to the risk of the whole path: the sum over the path counts twice only
+            what touches on two of its motions.
         "survival": integral along the motion, per metre, of -log(1 - p(q)), p(q) that the
-            robot touches anything at q. What touches one object over 10 cm costs ten times
-            what touches it over 1 cm, although the risk may be the same.
+            robot touches anything at q. An object touched over 10 cm costs ten times as much
+            as over 1 cm, although the risk may be the same.
         "occupancy": integral of the sum over spheres of the largest P(occupied) in each.
         "entropy": integral of the mean entropy in the robot's volume, nats. Both know no
             allowed contacts, and are 0 (occupancy: or 1) where all posterior worlds agree.
@@ -268,9 +261,8 @@ class VPrismMinimaxRiskObjective(_RiskBase):
         spacing: float = 0.02,
         cost: PathCost | None = None,
     ) -> None:
-        super().__init__(
-            si, checker, PathCost(checker, kind, spacing, 0.0, True) if cost is None else cost
-        )
+        cost = PathCost(checker, kind, spacing, 0.0, True) if cost is None else cost
+        super().__init__(si, checker, cost)
 
     def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the largest rate on the straight motion between two states."""

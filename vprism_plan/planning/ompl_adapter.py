@@ -43,9 +43,6 @@ _new_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
 _STRAIGHT_COMPOUNDS = ("CompoundStateSpace", "SE2StateSpace")
 
 
-# --- spaces ------------------------------------------------------------------------------
-
-
 def state_space(robot: RobotLike) -> Any:
     """Return the OMPL space of a robot's configurations, with its joint limits.
 
@@ -137,9 +134,6 @@ def nearest_turns(
     return np.where(wraps, q - _TURN * turns, q)
 
 
-# --- states ------------------------------------------------------------------------------
-
-
 def to_array(space: Any, state: Any) -> Configuration:
     """Return the coordinates of an OMPL state in flat order, as a new array."""
     values: list[float] = []
@@ -193,16 +187,13 @@ class _Buffers(threading.local):
 class StateReader:
     """Copies OMPL states of one space into preallocated arrays.
 
-    `fast` says whether states are serialised straight into numpy memory (about 0.1
-    microseconds) or read element by element. Buffers are per thread, because a kernel
-    that releases the GIL must not see its input overwritten by another thread.
+    `fast` says whether states are serialised straight into numpy memory (0.1 microseconds) or
+    read element by element. Buffers are per thread, because a kernel that releases the GIL
+    must not see its input overwritten.
     """
 
     def __init__(self, space: Any, dof: int) -> None:
-        """Prepare for `space`, which must have `dof` straight coordinates.
-
-        Raises PlanningError naming both numbers if they differ.
-        """
+        """Prepare for `space`; PlanningError if it has not `dof` straight coordinates."""
         self.wraps = np.array(wrapping_coordinates(space))
         if len(self.wraps) != dof:
             raise PlanningError(
@@ -246,17 +237,13 @@ def _serialisation_works(space: Any, dof: int) -> bool:
     return bool(np.array_equal(buffer, to_array(space, state)))
 
 
-# --- the two classes ---------------------------------------------------------------------
-
-
 class VPrismStateValidityChecker(ob.StateValidityChecker):
     """OMPL's question "is this state valid?", answered by a checker."""
 
     def __init__(self, si: Any, checker: CheckerLike) -> None:
         """Attach `checker` to the space of `si` (one dimension per joint, flat order).
 
-        Raises PlanningError if the dimensions differ or the space is not made of
-        RealVector and SO2 parts.
+        Raises PlanningError if dimensions differ or a part is neither RealVector nor SO2.
         """
         super().__init__(si)
         self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
@@ -342,19 +329,11 @@ class VPrismMotionValidator(ob.MotionValidator):
 def last_valid(
     checker: CheckerLike, qa: Configuration, qb: Configuration, tolerance: float = 1e-3
 ) -> tuple[Configuration | None, float]:
-    """Return how far the straight motion from qa to qb is certified valid.
+    """Return how far the straight motion from qa to qb, both (dof,), is certified valid.
 
-    Bisects with `checker.check_motion`, so every part up to the answer is certified.
-
-    Args:
-        checker: the checker.
-        qa: start (dof,), radians or metres.
-        qb: end (dof,).
-        tolerance: width of the last bisection interval, as a fraction of the motion.
-
-    Returns:
-        The furthest certified configuration and its fraction in [0, 1]; (None, 0.0)
-        if qa itself is invalid.
+    Bisects with `checker.check_motion`, so every part up to the answer is certified, until the
+    interval is `tolerance`, a fraction of the motion. Returns the furthest certified
+    configuration and its fraction in [0, 1]; (None, 0.0) if qa itself is invalid.
     """
     qa = joint_values(qa, checker.robot, "qa")
     qb = joint_values(qb, checker.robot, "qb")

@@ -19,20 +19,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan.planning.objectives import PathCost
-from vprism_plan.planning.protocols import CheckerLike, Configuration, Waypoints
+from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, Waypoints
 from vprism_plan.planning.result import PlanReport, PlanResult
 
 Check = Callable[[np.ndarray, np.ndarray], bool]
-Now = Callable[[], float]
 
 _log = logging.getLogger(__name__)
 
 _ROUNDING = 1e-9  # radians or metres beyond a joint limit that count as on it
-
-_MOST_CUTS = 120
-_FUTILE_CUTS = 25
-# Ends of a cut this near to a waypoint, as a share of the path, are moved onto it.
-_SNAP = 0.02
+_MOST_CUTS, _FUTILE_CUTS = 120, 25
+_SNAP = 0.02  # share of the path: ends of a cut this near to a waypoint are moved onto it
 _WORTHWHILE = 1e-6
 _FUTILE_MOVES = 400
 _MOVE_RANGE = (0.003, 0.6)  # Euclidean in joint space
@@ -212,8 +208,7 @@ def _moved(path: Waypoints, rng: np.random.Generator, cost: PathCost) -> Waypoin
 def resample(path: Waypoints, check: Check, spacing: float) -> Waypoints:
     """Insert equally spaced waypoints on edges longer than `spacing`.
 
-    The pieces of an edge that was accepted within a tolerance may not all pass by
-    themselves; such an edge stays whole.
+    An edge, accepted within a tolerance, whose pieces do not all pass by themselves stays whole.
     """
     rows = [path[0]]
     for edge in pairwise(path):
@@ -255,15 +250,12 @@ def verified(
     if refused:
         _log.warning("edge %d of the final path failed its verification", edge)
         reason = "it leaves the joint limits" if beyond else one_line(verdicts[-1])
-        return PlanResult(
-            path=None,
-            status="verification_failed",
-            report=replace(report, goal_index=None),
-            message=f"edge {edge} of {len(path) - 1} of the final path was refused when checked "
-            f"again: {reason}",
-            approximate_path=path,
-            explanation=verdicts[-1],
+        report = replace(report, goal_index=None)
+        message = (
+            f"edge {edge} of {len(path) - 1} of the final path was refused when checked again: "
+            f"{reason}"
         )
+        return PlanResult(None, "verification_failed", report, message, path, verdicts[-1])
     clearances = [checker.clearance(q) for q in interpolated(path, clearance_step)]
     shares: dict[str, float] = {}
     for q in path:
@@ -279,13 +271,11 @@ def verified(
         tolerance=float(max(verdict.tolerance for verdict in verdicts)),
         shares=shares,
     )
-    return PlanResult(
-        path=path,
-        status="exact",
-        report=report,
-        message=f"path of {len(path)} waypoints, length {report.path_length:.3g}, smallest "
-        f"clearance {report.min_clearance:.3g} m in {len(clearances)} samples",
+    message = (
+        f"path of {len(path)} waypoints, length {report.path_length:.3g}, smallest clearance "
+        f"{report.min_clearance:.3g} m in {len(clearances)} samples"
     )
+    return PlanResult(path, "exact", report, message)
 
 
 def one_line(report: Any) -> str:

@@ -20,9 +20,9 @@ from vprism_plan.planning.goals import (
     valid_goals,
 )
 from vprism_plan.planning.objectives import PathCost, RiskObjective
-from vprism_plan.planning.path import Now, one_line
+from vprism_plan.planning.path import one_line
 from vprism_plan.planning.planners import planner_kind, planners
-from vprism_plan.planning.protocols import CheckerLike, Configuration, SecondOpinion
+from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, SecondOpinion
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import SearchRequest, clock_named
 
@@ -64,9 +64,9 @@ def plan(
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
         start: start configuration (dof,), radians or metres.
         goal: goal configuration (dof,); or several, (g, dof), of which any will do; or the
-            pose (4, 4) of the end effector in the world frame; or a `ReachRegion`. Where
-            some configurations are refused, `report.refused_goals` says why. (A robot of
-            four joints: a (4, 4) array is a pose if its last row is 0 0 0 1.)
+            pose (4, 4) of the end effector in the world frame (for a robot of four joints: if
+            its last row is 0 0 0 1); or a `ReachRegion`. `report.refused_goals` says which
+            were refused and why.
         planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
             BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
         time_limit: time for the search in seconds, more than 0; on `clock`. Preparing an
@@ -92,9 +92,8 @@ def plan(
         second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
             the path is still handed out: the report and the message say so.
         clock: what limits, and all times of the report, are measured by: "wall", or
-            "process", the processor time of this process, which makes measurements on a
-            busy machine comparable (a search that waits for nothing takes the same; one
-            that waits, as for a slow checker, ends by the wall clock after fifty times the limit).
+            "process", the processor time of this process, comparable on a busy machine (a
+            search that waits, as for a slow checker, ends after fifty times the limit).
         objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
             objective are accepted; shortening then never raises the cost, and afterwards
             waypoints are moved, within `simplify_time`, where that lowers it. A straight
@@ -102,15 +101,12 @@ def plan(
         warm_start: with a risk, whether RRTstar, InformedRRTstar and SORRTstar are given the
             path of a quick RRTConnect to begin with, out of the time limit, and draw half of
             their samples around the best path so far.
-        margins: metres beyond the checker's own margin, decreasing, none below 0, such as
-            (0.02, 0.01, 0.005, 0.0); the checker needs `with_extra_margin`. Each is planned
-            with, the widest first, for an equal share of the time that is left, and the first
-            path found is returned; its `message` names the margin. A map's surface is nowhere
-            exact, least behind what the camera saw, and one margin that allows for that
-            refuses problems which have no room for it: with room to spare this keeps away,
-            in a narrow place it goes through. If there is no path, the last answer is
-            returned; put 0 last, or problems that only the checker's own margin allows stay
-            unsolved.
+        margins: metres beyond the checker's own margin, decreasing, such as (0.02, 0.01,
+            0.005, 0.0): with room to spare the path keeps away, in a narrow place it goes
+            through. The widest comes first, each with an equal share of the time that is left;
+            the first path is returned, and its `message` names the margin, or else the last
+            answer. Without 0 at the end, problems that only the checker's own margin allows
+            stay unsolved. The checker needs `with_extra_margin`.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -163,8 +159,8 @@ def _widest(
 ) -> PlanResult:
     """Return the answer with the widest margin that has a path, else the last answer."""
     steps = np.asarray(margins, dtype=np.float64)
-    bad = steps.ndim != 1 or len(steps) == 0 or not np.isfinite(steps).all()
-    if bad or (steps < 0.0).any() or (np.diff(steps) >= 0.0).any():
+    good = steps.ndim == 1 and len(steps) > 0 and np.isfinite(steps).all()
+    if not (good and (steps >= 0.0).all() and (np.diff(steps) < 0.0).all()):
         raise PlanningError(
             f"margins is {margins!r}; it must hold decreasing margins of at least 0 m, such as "
             "(0.02, 0.01, 0.005, 0.0)"
@@ -186,9 +182,6 @@ def _widest(
     return result
 
 
-# --- before the search -------------------------------------------------------------------
-
-
 def _prepared(
     checker: CheckerLike,
     start: Configuration,
@@ -199,12 +192,7 @@ def _prepared(
     now: Now,
 ) -> tuple[np.ndarray, PathCost | None, PlanReport] | PlanResult:
     """Return the goals, what paths cost (None for length) and the report, or a refusal."""
-    report = PlanReport(
-        planner=request.planner,
-        seed=request.seed,
-        time_limit=request.time_limit,
-        clock=request.clock,
-    )
+    report = PlanReport(request.planner, request.seed, request.time_limit, clock=request.clock)
     refusal = refuse(checker, start, "start", report)
     if refusal is not None:
         return refusal
@@ -247,14 +235,12 @@ def _prepared(
     report = replace(report, objective=objective.name, objective_time=took)
     if request.time_limit - took > 0.0:
         return goals, cost, report
-    return PlanResult(
-        path=None,
-        status="timeout",
-        report=report,
-        message=f"preparing the objective '{objective.name}' took {took:.2f} s of the "
+    message = (
+        f"preparing the objective '{objective.name}' took {took:.2f} s of the "
         f"{request.time_limit:g} s allowed; what was prepared is kept: allow more time, plan "
-        "again, or prepare it ahead by objective.cost(checker)",
+        "again, or prepare it ahead by objective.cost(checker)"
     )
+    return PlanResult(None, "timeout", report, message)
 
 
 def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
@@ -273,9 +259,6 @@ def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
         )
 
 
-# --- after it ----------------------------------------------------------------------------
-
-
 def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResult:
     """Say in the report, and the message, what the robot ends touching because it may."""
     if result.path is None:
@@ -284,11 +267,9 @@ def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResu
     if not touching:
         return result
     named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
-    return replace(
-        result,
-        report=replace(result.report, allowed_contacts=touching),
-        message=f"{result.message}; ends touching, as allowed: {named}",
-    )
+    message = f"{result.message}; ends touching, as allowed: {named}"
+    report = replace(result.report, allowed_contacts=touching)
+    return replace(result, report=report, message=message)
 
 
 def _reviewed(

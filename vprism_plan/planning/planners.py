@@ -23,8 +23,7 @@ class PlannerKind:
     Attributes:
         make: the OMPL class.
         optimising: whether it keeps improving its path until it is told to stop.
-        honours_objective: whether it minimises what it is given; the others minimise length,
-            or nothing.
+        honours_objective: whether it minimises what it is given, not length or nothing.
         obeys_threshold: whether it stops at a path that satisfies the objective.
         reports_cost: whether it says, while it searches, what its best path costs.
         resumes: whether it goes on where it stopped when it is asked to solve once more.
@@ -33,9 +32,8 @@ class PlannerKind:
             length on spaces without continuous joints directly, otherwise by rejection.
         has_range: whether the length of its steps can be set.
         needs_projection: whether it needs a projection of the state space.
-        starts_thread: whether it searches for solutions in a second thread. That thread
-            deadlocks as soon as it needs Python: for an objective, a goal region, a further
-            goal state or a termination condition.
+        starts_thread: whether it has a second thread, which deadlocks as soon as it needs
+            Python: for an objective, a goal region, a further goal or a termination condition.
         note: what else one should know.
     """
 
@@ -56,21 +54,10 @@ class PlannerKind:
 _IMPROVES: dict[str, Any] = {"optimising": True, "reports_cost": True, "informed": True}
 _STAR: dict[str, Any] = {**_IMPROVES, "honours_objective": True, "resumes": True}
 _TREE_STAR: dict[str, Any] = {**_STAR, "goal_bias": True}
-_ONE_BATCH: dict[str, Any] = {
-    "honours_objective": True,
-    "has_range": False,
-    "note": "draws its samples once: one path, or none, whatever time is left",
-}
-_ROADMAP: dict[str, Any] = {
-    "has_range": False,
-    "starts_thread": True,
-    "note": "one goal configuration, wall clock, length only: anything else would deadlock",
-}
-_PIECES: dict[str, Any] = {
-    "needs_projection": True,
-    "note": "keeps nothing of a motion that is blocked halfway (see `last_valid`)",
-}
 _LENGTH = "reads the length of its paths, never an objective"
+_ONE_BATCH = "draws its samples once: one path, or none, whatever time is left"
+_ROADMAP = "one goal configuration, wall clock, length only: anything else would deadlock"
+_KEEPS_NOTHING = "keeps nothing of a motion that is blocked halfway (see `last_valid`)"
 
 PLANNERS: dict[str, PlannerKind] = {
     "RRTConnect": PlannerKind(og.RRTConnect, note="grows two trees, usually the quickest"),
@@ -80,13 +67,13 @@ PLANNERS: dict[str, PlannerKind] = {
     "SORRTstar": PlannerKind(og.SORRTstar, **_TREE_STAR),
     "BITstar": PlannerKind(og.BITstar, has_range=False, **_STAR),
     "AORRTC": PlannerKind(og.AORRTC, obeys_threshold=False, note=_LENGTH, **_IMPROVES),
-    "FMT": PlannerKind(og.FMT, **_ONE_BATCH),
-    "BFMT": PlannerKind(og.BFMT, **_ONE_BATCH),
-    "PRM": PlannerKind(og.PRM, **_ROADMAP),
-    "PRMstar": PlannerKind(og.PRMstar, optimising=True, **_ROADMAP),
-    "KPIECE1": PlannerKind(og.KPIECE1, **_PIECES),
-    "BKPIECE1": PlannerKind(og.BKPIECE1, **_PIECES),
-    "LBKPIECE1": PlannerKind(og.LBKPIECE1, **_PIECES),
+    "FMT": PlannerKind(og.FMT, honours_objective=True, has_range=False, note=_ONE_BATCH),
+    "BFMT": PlannerKind(og.BFMT, honours_objective=True, has_range=False, note=_ONE_BATCH),
+    "PRM": PlannerKind(og.PRM, has_range=False, starts_thread=True, note=_ROADMAP),
+    "PRMstar": PlannerKind(og.PRMstar, True, has_range=False, starts_thread=True, note=_ROADMAP),
+    "KPIECE1": PlannerKind(og.KPIECE1, needs_projection=True, note=_KEEPS_NOTHING),
+    "BKPIECE1": PlannerKind(og.BKPIECE1, needs_projection=True, note=_KEEPS_NOTHING),
+    "LBKPIECE1": PlannerKind(og.LBKPIECE1, needs_projection=True, note=_KEEPS_NOTHING),
 }
 
 
@@ -159,11 +146,8 @@ class GuidedGoal(ob.GoalSampleableRegion):
 
     The tree reaches a goal by growing exactly to it; the last state of the lead is one.
     `sampleGoal` hands the lead out once, then only states around the best path: of goals the
-    tree would collect copies. `step` is how far the planner grows at once, in the metric of
-    the space.
-
-    Attributes:
-        path: (t, dof) around which it samples; from `lead` on.
+    tree would collect copies, around `path` (t, dof). `step` is how far the planner grows at
+    once, in the metric of the space.
     """
 
     def __init__(self, si: Any, goals: Float[np.ndarray, "g dof"], seed: int, step: float) -> None:

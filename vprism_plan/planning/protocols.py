@@ -6,6 +6,7 @@ object with these members, which is how the adapter is tested and how a user bri
 a checker of their own.
 """
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float
 # Radians or metres, in the order of the robot's joints; rows of any number.
 Configuration = Float[np.ndarray, " dof"]
 Waypoints = Float[np.ndarray, "_ dof"]
+Now = Callable[[], float]  # reads a clock, seconds
 
 
 @runtime_checkable

@@ -38,10 +38,8 @@ from vprism_plan.planning.planners import (
     make_planner,
     planner_kind,
 )
-from vprism_plan.planning.protocols import CheckerLike, Configuration, Waypoints
+from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, Waypoints
 from vprism_plan.planning.result import Improvement
-
-Now = Callable[[], float]
 
 MAX_SEED = 2**32 - 2
 # Times the limit after which a search by processor time ends by the wall clock: OMPL sleeps
@@ -101,10 +99,7 @@ class SearchRequest:
 
 @dataclass(frozen=True)
 class SearchOutcome:
-    """What a search found; `path` (T, dof) begins at the start as given and is not yet verified.
-
-    `history` has the best path each time it had become noticeably better.
-    """
+    """What a search found; `path` (T, dof) begins at the start as given and is not yet verified."""
 
     status: Literal["exact", "approximate", "timeout"]
     path: np.ndarray | None
@@ -130,9 +125,8 @@ def search(
     """
     kind = planner_kind(request.planner)
     with quiet_ompl():
-        # 0 would mean "from the clock". Generators that exist already keep their state, so this
-        # comes before the space. A second time in a process it is an error in OMPL's log, about
-        # a determinism that generators created later do have.
+        # 0 would mean "from the clock". Only generators made from now on have this seed, so it
+        # comes first; a second time in a process OMPL logs an error that does not hold for them.
         ou.RNG.setSeed(request.seed + 1)
         space = state_space(checker.robot)
         si = ob.SpaceInformation(space)
@@ -148,7 +142,10 @@ def search(
         planner = make_planner(kind, si, request.step)
         _set_objective(problem, si, checker, request, cost)
         guided: GuidedGoal | None = None
-        problem.setGoal(_plain_goal(si, space, goals))
+        goal = ob.GoalState(si) if len(goals) == 1 else ob.GoalStates(si)
+        for q in goals:
+            (goal.setState if len(goals) == 1 else goal.addState)(to_state(space, q))
+        problem.setGoal(goal)
         if lead is not None:
             planner.setProblemDefinition(problem)
             planner.setup()  # settles the planner's steps
@@ -179,17 +176,6 @@ def search(
             path = _waypoints(reader, solution, start)
         took, asked = planned - began, (states.checks, motions.checks)
         return SearchOutcome(verdict, path, goal_index, took, *asked, history)
-
-
-def _plain_goal(si: Any, space: Any, goals: Float[np.ndarray, "g dof"]) -> Any:
-    if len(goals) == 1:
-        single = ob.GoalState(si)
-        single.setState(to_state(space, goals[0]))
-        return single
-    goal = ob.GoalStates(si)
-    for q in goals:
-        goal.addState(to_state(space, q))
-    return goal
 
 
 def _set_objective(
@@ -246,20 +232,19 @@ def _solve(
                 history.append(Improvement(now() - began, value, path))
                 if guided is not None:
                     guided.path = path
-            # A planner that returns again and again has nothing left to improve: a cost of 0.
+            # A planner that returns again and again has a cost of 0: nothing is left to improve.
             if progress.settled or idle > 1 or now() >= end or request.stop == "first":
                 break
         return status, tuple(history)
     finally:
-        progress.release()
+        del progress.best_cost  # AORRTC keeps its termination condition: a cycle
 
 
 class _Progress:
     """A termination condition: the best cost has become noticeably better, or has settled.
 
-    Called once per iteration of the planner. Between two calls of `solve` the best path can
-    be read; while it runs, it cannot. Calls and costs decide, not clocks, so the same seed
-    stops at the same iterations.
+    Between two calls of `solve` the best path can be read; while it runs, it cannot. Calls
+    (one per iteration) and costs decide, not clocks: the same seed stops at the same ones.
 
     Attributes:
         settled: whether `patience` calls brought less than the relative `tolerance`, where
@@ -268,7 +253,7 @@ class _Progress:
 
     def __init__(self, planner: Any, request: SearchRequest, kind: PlannerKind) -> None:
         self.settled = False
-        self._best_cost = planner.bestCost
+        self.best_cost = planner.bestCost
         # Of a planner that cannot resume only the first solution counts.
         self._least = _NOTICEABLE if kind.resumes else 2.0
         self._noted = self._reference = math.inf
@@ -279,7 +264,7 @@ class _Progress:
         self._calls = self._reference_call = 0
 
     def __call__(self) -> bool:
-        cost = self._best_cost().value()
+        cost = self.best_cost().value()
         first = cost < self._noted == math.inf
         if first or cost < self._noted * (1.0 - self._least):
             self._noted = cost
@@ -292,10 +277,6 @@ class _Progress:
         found = self._reference < math.inf
         self.settled = found and self._calls - self._reference_call >= self._patience
         return self.settled
-
-    def release(self) -> None:
-        """Let go of the planner: AORRTC keeps its termination condition, a cycle."""
-        del self._best_cost
 
 
 def _reached(reader: StateReader, solution: Any, goals: Float[np.ndarray, "g dof"]) -> int | None:
@@ -317,10 +298,9 @@ def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoint
 class _HeldErrors:
     """A checker whose first exception waits until the search is over.
 
-    PRM and PRMstar run a second C++ thread while they sample. An exception that leaves
-    `solve` destroys that thread unjoined, and the process ends with `std::terminate`. So the
-    first one is held back, every later question is answered "invalid" without asking the
-    checker, the search is told to stop, and `solve` raises the exception again.
+    PRM and PRMstar run a second C++ thread. An exception that leaves `solve` destroys it
+    unjoined, and the process ends with `std::terminate`. So the first one is held back, later
+    questions are answered "invalid", the search is told to stop, and `solve` raises it again.
     """
 
     def __init__(self, checker: CheckerLike) -> None:
@@ -360,9 +340,6 @@ class _HeldErrors:
         finally:
             del error  # its traceback holds this frame: a cycle that would keep the search alive
         return status
-
-
-# --- clocks, log and seed ----------------------------------------------------------------
 
 
 def clock_named(name: str) -> Now:

@@ -84,13 +84,11 @@ def time_parameterize(
         robot: brings `joint_names` and the default `velocity_limits`.
         path: waypoints (t, dof), at least one, as in `PlanResult.path`.
         velocity_limits: (dof,) rad/s or m/s; the robot's own if None.
-        acceleration_limits: (dof,) per second squared; if None, each joint reaches its
-            velocity limit in half a second.
+        acceleration_limits: (dof,) per s^2; None: each joint is at full speed in half a second.
         scale: share of both limits to use, more than 0 and at most 1.
 
     Returns:
-        The trajectory: at rest at both ends and at every corner of the path, on the
-        path throughout, through every waypoint.
+        At rest at both ends and at every corner; on the path, through every waypoint.
 
     Raises:
         PlanningError: the path or a limit is not usable; names the joint and the value.
@@ -98,10 +96,8 @@ def time_parameterize(
     path = np.asarray(path, dtype=np.float64)
     names = tuple(robot.joint_names)
     if path.ndim != 2 or path.shape[1] != len(names) or len(path) == 0:
-        raise PlanningError(
-            f"path has shape {path.shape}; it must be (waypoints, {len(names)}) with at least "
-            "one waypoint"
-        )
+        needed = f"it must be (waypoints, {len(names)}) with at least one waypoint"
+        raise PlanningError(f"path has shape {path.shape}; {needed}")
     if not np.isfinite(path).all():
         raise PlanningError("the path holds NaN or infinite values")
     if not 0.0 < scale <= 1.0:
@@ -163,43 +159,38 @@ def _timed(
     v, a = float(np.min(speed[moving] / size)), float(np.min(push[moving] / size))
     ramp = min(v / a, math.sqrt(1.0 / a))
     top = a * ramp
-    cruise = 1.0 / top - ramp
+    rate, cruise = top / ramp, 1.0 / top - ramp
     total = cruise + 2.0 * ramp
+
+    def profile(t: float) -> tuple[float, float]:
+        """Return s and s' of the trapezoid at time t."""
+        if t <= ramp:
+            return 0.5 * rate * t * t, rate * t
+        if t < total - ramp:
+            return top * (t - 0.5 * ramp), top
+        left = total - t
+        return 1.0 - 0.5 * rate * left * left, rate * left
+
+    def time_at(s: float) -> float:
+        """Return the time at which the trapezoid reaches s."""
+        if s <= 0.5 * top * ramp:
+            return math.sqrt(2.0 * s / rate)
+        if s <= 1.0 - 0.5 * top * ramp:
+            return s / top + 0.5 * ramp
+        return total - math.sqrt(2.0 * (1.0 - s) / rate)
+
     inner = np.linalg.norm(line[1:-1] - line[0], axis=1) / np.linalg.norm(whole)
-    events = [
-        (_time_at(float(s), ramp, top, total), q) for s, q in zip(inner, line[1:-1], strict=True)
-    ]
+    events = [(time_at(float(s)), q) for s, q in zip(inner, line[1:-1], strict=True)]
     knees = [ramp] if cruise <= 1e-9 * total else [ramp, ramp + cruise]
-    events += [(t, line[0] + _profile(t, ramp, top, total)[0] * whole) for t in knees]
+    events += [(t, line[0] + profile(t)[0] * whole) for t in knees]
     events.sort(key=lambda event: event[0])
     previous = 0.0
     for t, q in events:
         # A knee that falls on a waypoint is one point, not two.
         if t - previous > 1e-9 * total and total - t > 1e-9 * total:
-            yield t, q, _profile(t, ramp, top, total)[1] * whole
+            yield t, q, profile(t)[1] * whole
             previous = t
     yield total, line[-1], 0.0 * whole
-
-
-def _profile(t: float, ramp: float, top: float, total: float) -> tuple[float, float]:
-    """Return s and s' of the trapezoid at time t."""
-    rate = top / ramp
-    if t <= ramp:
-        return 0.5 * rate * t * t, rate * t
-    if t < total - ramp:
-        return top * (t - 0.5 * ramp), top
-    left = total - t
-    return 1.0 - 0.5 * rate * left * left, rate * left
-
-
-def _time_at(s: float, ramp: float, top: float, total: float) -> float:
-    """Return the time at which the trapezoid reaches s."""
-    rate = top / ramp
-    if s <= 0.5 * top * ramp:
-        return math.sqrt(2.0 * s / rate)
-    if s <= 1.0 - 0.5 * top * ramp:
-        return s / top + 0.5 * ramp
-    return total - math.sqrt(2.0 * (1.0 - s) / rate)
 
 
 def write_trajectory(
@@ -208,13 +199,8 @@ def write_trajectory(
     """Write a trajectory as `trajectory_msgs/JointTrajectory`, whole or not at all.
 
     Accelerations and efforts stay empty, which the message allows: given accelerations,
-    controllers fit quintics, which a trapezoidal profile is not.
-
-    Args:
-        path_file: the file to write.
-        robot: brings `joint_names`, in the order of the columns.
-        trajectory: what to write; radians, metres, seconds.
-        frame_id: frame for the header; joint motions need none.
+    controllers fit quintics, which a trapezoidal profile is not. Joint motions need no
+    `frame_id`. The robot brings `joint_names`, in the order of the columns.
 
     Raises:
         PlanningError: joints and columns differ in number, or two points fall on the
@@ -256,23 +242,20 @@ def read_trajectory(path_file: str | Path) -> tuple[tuple[str, ...], Trajectory]
         names = tuple(str(name) for name in message["joint_names"])
         points = message["points"]
         ticks = [_ticks(p["time_from_start"]) for p in points]
-        rows = (len(points), len(names))
-        trajectory = Trajectory(
-            np.array(ticks, dtype=np.float64) / _NANOSECONDS,
-            np.array([p["positions"] for p in points], dtype=np.float64).reshape(rows),
-            np.array([p["velocities"] for p in points], dtype=np.float64).reshape(rows),
+        times, wrong = np.array(ticks, dtype=np.float64) / _NANOSECONDS, ""
+        positions, velocities = (
+            np.array([p[key] for p in points], np.float64).reshape(len(points), len(names))
+            for key in ("positions", "velocities")
         )
-        times, wrong = trajectory.times, ""
-        values = (times, trajectory.positions, trajectory.velocities)
         if len(times) == 0:
             wrong = "it has no points"
-        elif not all(np.isfinite(value).all() for value in values):
+        elif not all(np.isfinite(value).all() for value in (times, positions, velocities)):
             wrong = "some of its values are not finite"
         elif times[0] < 0.0 or not (np.diff(times) > 0.0).all():
             wrong = "its times must rise, from 0 or later"
         if wrong:
             raise PlanningError(f"{path} is no motion: {wrong}")
-        return names, trajectory
+        return names, Trajectory(times, positions, velocities)
 
 
 def _ticks(time: Any) -> int:
