@@ -44,12 +44,12 @@ def within_risk(
     left out. Returns the first path within the bound; otherwise the least risky one as
     "too_risky", or the refusal of the first attempt.
     """
-    max_risk = getattr(checker, "max_risk", None)
+    bounded: Any = checker if hasattr(checker, "tightened") else None
+    max_risk = getattr(bounded, "max_risk", None)
     if max_risk is None:
         return attempt(checker, time_limit, 0)
     began, spent = now(), 0.0
     best: PlanResult | None = None
-    bounded: Any = checker
     for level in count():
         judge = bounded.tightened(level) if level else checker
         left = time_limit - (now() - began - spent) if level else time_limit
