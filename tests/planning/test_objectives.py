@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Objectives inside OMPL, and planning with them, where costs are known exactly."""
 
+import sys
 from itertools import pairwise
 
 import disk_world
@@ -23,8 +24,8 @@ from vprism_plan.planning import (
     state_space,
     to_state,
 )
-from vprism_plan.planning._attempt import not_found
-from vprism_plan.planning._shortcut import cheapen, shorten
+from vprism_plan.planning.attempts import not_found
+from vprism_plan.planning.path import cheapen, shorten
 
 START, GOAL = [-0.7, 0.0], [0.7, 0.0]
 ZIGZAG = np.array([[-0.9, -0.9], [-0.9, 0.9], [-0.8, 0.9], [0.0, 0.9], [0.9, 0.9], [0.9, -0.9]])
@@ -245,7 +246,9 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.time = 0.0
-        monkeypatch.setattr("vprism_plan.planning.planner.clock_named", lambda _: lambda: self.time)
+        # The function of this name hides its module.
+        module = sys.modules["vprism_plan.planning.plan"]
+        monkeypatch.setattr(module, "clock_named", lambda _: lambda: self.time)
 
     def step(self, seconds, done):
         def run():
@@ -279,11 +282,11 @@ def test_the_search_gets_what_preparing_left(monkeypatch):
     monkeypatch.setattr(Prepared, "steps", [clock.step(t, done) for t in (0.5, 1.5)])
     limits = []
 
-    def searched(judge, start, goals, request, finish, report, begin):
-        limits.append(request.time_limit)
+    def searched(judge, query, report, lead):
+        limits.append(query.request.time_limit)
         return not_found("timeout", None, report)
 
-    monkeypatch.setattr("vprism_plan.planning.planner.searched", searched)
+    monkeypatch.setattr("vprism_plan.planning.attempts.searched", searched)
     result = plan(one_disk(), START, GOAL, "RRTstar", 5.0, objective=Prepared(slope))
     assert done == [0.5, 1.5]
     assert limits == [pytest.approx(3.0)]

@@ -18,8 +18,8 @@ from vprism_plan.planning import (
     RobotLike,
     VPrismMotionValidator,
     VPrismStateValidityChecker,
-    _spaces,
     last_valid,
+    ompl_adapter,
     quiet_ompl,
     state_space,
     to_array,
@@ -204,7 +204,7 @@ def test_a_second_thread_gets_its_own_answer():
 
 
 def test_without_the_capsule_route_the_answers_are_the_same(monkeypatch):
-    monkeypatch.setattr(_spaces, "_CAPSULE_NAME", b"renamed_by_nanobind")
+    monkeypatch.setattr(ompl_adapter, "_CAPSULE_NAME", b"renamed_by_nanobind")
     checker = one_disk()
     si = attach(checker)
     space = si.getStateSpace()

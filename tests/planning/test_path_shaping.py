@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vprism_plan.planning import plan
-from vprism_plan.planning._shortcut import drop_waypoints, shorten
-from vprism_plan.planning._verify import MotionCheck, resample
+from vprism_plan.planning.path import MotionCheck, drop_waypoints, resample, shorten
 
 ZIGZAG = np.array([[-0.9, -0.9], [-0.9, 0.9], [-0.8, 0.9], [0.0, 0.9], [0.9, 0.9], [0.9, -0.9]])
 

@@ -11,8 +11,8 @@ from ompl import util as ou
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import plan, quiet_ompl
-from vprism_plan.planning._planners import PLANNERS
-from vprism_plan.planning._runtime import checked_seed
+from vprism_plan.planning.planners import PLANNERS
+from vprism_plan.planning.search import checked_seed
 
 START, GOAL = [-0.7, -0.5], [0.7, -0.5]
 # The rest of `planners()` is tested in test_planners.py, in less detail.

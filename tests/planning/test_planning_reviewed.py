@@ -7,11 +7,11 @@ import pytest
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning import RiskObjective, _attempt, plan, state_space
-from vprism_plan.planning._guide import GuidedGoal
-from vprism_plan.planning._search import SearchOutcome
-from vprism_plan.planning._verify import MotionCheck, verified
+from vprism_plan.planning import RiskObjective, attempts, plan, state_space
+from vprism_plan.planning.path import MotionCheck, verified
+from vprism_plan.planning.planners import GuidedGoal
 from vprism_plan.planning.result import PlanReport
+from vprism_plan.planning.search import SearchOutcome
 
 
 class NoLimits(disk_world.DiskChecker):
@@ -109,7 +109,7 @@ def test_a_known_direct_motion_is_not_thrown_away(options, monkeypatch):
     def nothing(*unused):
         return SearchOutcome("timeout", None, None, 0.1, 0, 0)
 
-    monkeypatch.setattr(_attempt, "search", nothing)
+    monkeypatch.setattr(attempts, "search", nothing)
     blocked_first = disk_world.DiskChecker([(0.0, 0.5)], [0.2], disk_world.robot())
     result = plan(
         blocked_first, [-0.5, 0.5], [[0.5, 0.5], [0.5, 0.0]], time_limit=0.3, simplify_time=0.1,
@@ -125,7 +125,7 @@ def test_the_goal_of_a_lead_round_a_continuous_joint_is_named(monkeypatch):
     def nothing(*unused):
         return SearchOutcome("timeout", None, None, 0.1, 0, 0)
 
-    monkeypatch.setattr(_attempt, "search", nothing)
+    monkeypatch.setattr(attempts, "search", nothing)
     turning = disk_world.DiskChecker([(2.5, 0.0)], [0.05], disk_world.robot(2, (0,)))
     goals = [[2.0, 0.0], [3.3 - 2.0 * np.pi, 0.3]]
     result = plan(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning import _spaces, state_space, to_array, to_state
+from vprism_plan.planning import ompl_adapter, state_space, to_array, to_state
 
 
 def names(space):
@@ -60,7 +60,7 @@ def test_a_limited_joint_without_a_range_is_named(low, high):
 def test_flat_order_is_joint_order_by_both_routes(continuous, q):
     space = state_space(disk_world.robot(5, sorted(continuous)))
     state = to_state(space, np.array(q))
-    reader = _spaces.StateReader(space, 5)
+    reader = ompl_adapter.StateReader(space, 5)
     assert reader.fast
     assert to_array(space, state).tolist() == q
     assert reader.read(state).tolist() == q
@@ -85,22 +85,22 @@ def test_what_is_not_a_configuration_is_refused(q):
 
 
 def test_without_the_capsule_route_the_slow_one_serves(monkeypatch):
-    monkeypatch.setattr(_spaces, "_CAPSULE_NAME", b"renamed_by_nanobind")
+    monkeypatch.setattr(ompl_adapter, "_CAPSULE_NAME", b"renamed_by_nanobind")
     space = state_space(disk_world.robot(4, (2,)))
-    reader = _spaces.StateReader(space, 4)
+    reader = ompl_adapter.StateReader(space, 4)
     assert not reader.fast
     state = to_state(space, np.array([0.1, 0.2, 0.3, 0.4]))
     assert reader.read(state).tolist() == [0.1, 0.2, 0.3, 0.4]
 
 
 def test_a_serialisation_that_answers_nonsense_is_not_used(monkeypatch):
-    monkeypatch.setattr(_spaces, "to_array", lambda space, state: np.full(2, 9.0))
-    assert not _spaces.StateReader(state_space(disk_world.robot(2)), 2).fast
+    monkeypatch.setattr(ompl_adapter, "to_array", lambda space, state: np.full(2, 9.0))
+    assert not ompl_adapter.StateReader(state_space(disk_world.robot(2)), 2).fast
 
 
 def test_threads_do_not_share_buffers():
     space = state_space(disk_world.robot(2))
-    reader = _spaces.StateReader(space, 2)
+    reader = ompl_adapter.StateReader(space, 2)
     mine = reader.read(to_state(space, np.array([0.1, 0.2])))
     theirs = []
     thread = threading.Thread(
@@ -123,4 +123,4 @@ def spaces_that_are_not_straight():
 def test_spaces_without_straight_motions_are_refused_by_name(which):
     name, space = spaces_that_are_not_straight()[which]
     with pytest.raises(PlanningError, match=name):
-        _spaces.wrapping_coordinates(space)
+        ompl_adapter.wrapping_coordinates(space)

@@ -22,10 +22,8 @@ _TIP_NAMES = ("tcp", "tool0", "tool", "ee_link", "ee", "tip", "end_effector", "h
 class Targets:
     """Where a link shall be, one target per row.
 
-    Attributes:
-        positions: (n, 3) of the link's origin in the world, metres.
-        rotations: (n, 3, 3) of the link in the world; None: any.
-        free_axis: (3,) unit vector in the link about which it may turn freely; None: none.
+    Positions are of the link's origin in the world, metres; without rotations, of the link in
+    the world, any will do. About `free_axis`, a unit vector in the link, it may turn freely.
     """
 
     positions: Float[np.ndarray, "n 3"]
@@ -35,23 +33,23 @@ class Targets:
 
 @dataclass(frozen=True)
 class Tip:
-    """A link that follows frame `frame` at the constant pose `offset` (4, 4).
-
-    Attributes:
-        chain: the frames that move it, itself first.
-    """
+    """A link that follows a frame at the constant pose `offset` (4, 4); `chain` moves it."""
 
     frame: int
     offset: np.ndarray
     chain: tuple[int, ...]
 
+    def behind(self, R: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations and positions (metres) of the link, by those of all frames, in the world."""
+        turned = R[:, self.frame]
+        return turned @ self.offset[:3, :3], turned @ self.offset[:3, 3] + t[:, self.frame]
+
 
 def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
     """Find the frame a link is attached to: the deepest one it does not move against.
 
-    Raises:
-        PlanningError: the robot has no kinematics or no such link, or None is asked for and
-            no link is recognisable as the end effector.
+    Raises PlanningError if the robot has no kinematics or no such link, or None is asked for
+    and no link is recognisable as the end effector.
     """
     if not (hasattr(robot, "arrays") and hasattr(robot, "link_poses")):
         raise PlanningError(
@@ -62,7 +60,14 @@ def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
     two = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     links = [robot.link_poses(q) for q in two]
     R, t = frame_poses(robot.arrays, two)
-    name = _default_link(tuple(links[0])) if link is None else link
+    name = link
+    if link is None:
+        endings = [(n, e) for e in _TIP_NAMES for n in reversed(links[0])]
+        name = next((n for n, e in endings if n == e or n.endswith("_" + e)), None)
+    if name is None:
+        raise PlanningError(
+            "no link is recognisable as the end effector; name one (`link`): " + ", ".join(links[0])
+        )
     if name not in links[0]:
         raise PlanningError(
             f"{robot.name} has no link {name!r}; its links are {', '.join(links[0])}"
@@ -70,41 +75,18 @@ def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
     for frame in reversed(range(len(parent))):
         offsets = [_rigid_inverse(R[i, frame], t[i, frame]) @ links[i][name] for i in (0, 1)]
         if np.allclose(offsets[0], offsets[1], atol=1e-9):
-            chain = []
-            walk = frame
-            while walk > 0:
-                chain.append(walk)
-                walk = int(parent[walk])
+            chain = [frame] if frame > 0 else []
+            while chain and parent[chain[-1]] > 0:
+                chain.append(int(parent[chain[-1]]))
             return Tip(frame, offsets[0], tuple(chain))
     raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
 
 
-def _default_link(names: tuple[str, ...]) -> str:
-    for ending in _TIP_NAMES:
-        for name in reversed(names):
-            if name == ending or name.endswith("_" + ending):
-                return name
-    raise PlanningError(
-        "no link is recognisable as the end effector; name one (`link`): " + ", ".join(names)
-    )
-
-
-def _rigid_inverse(
-    R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "4 4"]:
+def _rigid_inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = R.T
     T[:3, 3] = -R.T @ t
     return T
-
-
-def tip_poses(
-    robot: Any, tip: Tip, q: Float[np.ndarray, "n dof"]
-) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
-    """Return rotations and positions (metres) of the link in the world."""
-    R, t = frame_poses(robot.arrays, q)
-    R_tip = R[:, tip.frame] @ tip.offset[:3, :3]
-    return R_tip, R[:, tip.frame] @ tip.offset[:3, 3] + t[:, tip.frame]
 
 
 def descend(
@@ -113,11 +95,9 @@ def descend(
     """Move each start q towards its target, within the joint limits.
 
     Damped least squares on the pose error (Buss 2004, "Introduction to inverse
-    kinematics", section 6), in float64 on the arrays that the collision kernels use.
-
-    Returns:
-        Configurations, and what is left of the error: metres, radians (0 where any
-        orientation will do).
+    kinematics", section 6), in float64 on the arrays that the collision kernels use. Returns
+    configurations, and what is left of the error: metres, radians (0 where any orientation
+    will do).
     """
     free = np.asarray(robot.continuous, dtype=bool)
     for _ in range(iterations):
@@ -137,8 +117,7 @@ def _error_and_jacobian(
     """Error (metres, rotation vector in the world) and the geometric Jacobian; three rows each
     if any orientation will do, six otherwise."""
     R, t = frame_poses(arrays, q)
-    R_tip = R[:, tip.frame] @ tip.offset[:3, :3]
-    t_tip = R[:, tip.frame] @ tip.offset[:3, 3] + t[:, tip.frame]
+    R_tip, t_tip = tip.behind(R, t)
     J = np.zeros((len(q), 6, q.shape[1]))
     for f in tip.chain:
         axis = R[:, f] @ arrays.axis[f]
@@ -161,9 +140,7 @@ def _error_and_jacobian(
     return np.concatenate([away, turn], axis=1), J
 
 
-def _turn_between(
-    a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n 3"]:
+def _turn_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """The shortest rotation vectors that turn unit vectors a to b."""
     across = np.cross(a, b)
     sine = np.linalg.norm(across, axis=1)

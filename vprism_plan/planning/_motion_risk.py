@@ -4,7 +4,7 @@
 import math
 from collections.abc import Callable
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,16 +12,14 @@ from jaxtyping import Float, Int
 
 from vprism_plan._kernels import objectives as kernels
 from vprism_plan.errors import PlanningError
+from vprism_plan.planning.protocols import Configuration
 
-Kind = Literal["survival", "joint", "occupancy", "entropy"]
 KINDS: tuple[str, ...] = ("survival", "joint", "occupancy", "entropy")
 _OF_FIELDS = ("occupancy", "entropy")
 
 _PAD = 0.25  # metres around what is uncertain in which distances to it are known
 _LEAST = 1e-3  # probability, or nats, below which a field counts as 0
 _MOST_KEPT = 200_000  # motions whose cost is remembered
-
-
 # The middle of a ball, and its surface towards the faces and the corners of a cube.
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _CORNERS = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3.0)
@@ -35,26 +33,11 @@ class MotionRisk:
     stretches that are far from anything uncertain are skipped. All samples of a motion are
     worked through in one compiled call, and its cost is remembered.
 
-    The rates of a configuration q:
-        survival: -log(1 - p(q)), p the share of the checker's posterior worlds in which the
-            robot touches anything; a bound from above of the marginal that
-            `checker.collision_probability(q)` gives.
-        occupancy: sum over the spheres of the largest P(occupied) found in each; at voxels
-            about which the posterior worlds agree it counts as 0 or 1.
-        entropy: mean entropy, nats, of the map in the volume of the moving spheres. Only
-            where posterior worlds can differ; elsewhere the map is certain, or has no support.
-
-    The cost of a motion is the integral of the rate over the way of the sphere that moves
-    farthest (a bound on it, metres), by the trapezoidal rule. "joint" is not an integral but
-    -log(1 - p) with p the share of worlds in which the robot touches anything anywhere on
-    the motion, the same world for the whole motion; summed over a path's edges it bounds
-    -log(1 - risk) of the path if touching on one edge does not make touching on another
-    less likely.
-
-    Args:
-        checker: a `CollisionChecker` over a `World`.
-        kind: one of the above.
-        spacing: metres of sphere motion.
+    `VPrismRiskObjective` says what the kinds are. p of "survival" is a bound from above of the
+    marginal that `checker.collision_probability(q)` gives. Integrals are over the way of the
+    sphere that moves farthest (a bound on it, metres), by the trapezoidal rule. "joint",
+    summed over a path's edges, bounds -log(1 - risk) of the path if touching on one edge does
+    not make touching on another less likely.
 
     Raises:
         PlanningError: an unknown kind, a spacing out of range, or no posterior.
@@ -79,7 +62,11 @@ class MotionRisk:
         self._touched = np.zeros(worlds.n_worlds, np.uint8)
         if kind in _OF_FIELDS:
             self._field = _field(worlds, self._at.world, kind)
-            self._weights = _weights(self._at, kind)
+            # 1 per sphere of the moving links, or its share of their volume.
+            self._weights = (self._at.sphere_tables >= 0).astype(np.float64)
+            if kind == "entropy":
+                self._weights *= self._at.radii**3
+                self._weights /= max(float(self._weights.sum()), 1e-300)
             self._directions = _POINTS if kind == "occupancy" else 0.8 * _POINTS
         self._marks = worlds.new_marks()
         # Asked once without a sphere, so that nothing compiles inside a planner's time limit.
@@ -87,55 +74,41 @@ class MotionRisk:
         self._sweep(q, q)
         self._tables = self._at.sphere_tables
 
-    def motion(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+    def motion(self, qa: Configuration, qb: Configuration) -> float:
         """Return the cost of the straight motion between two configurations, either way."""
         a, b = qa.tobytes(), qb.tobytes()
-        key = (a, b) if a <= b else (b, a)
-        cost = self._kept.get(key)
+        if a > b:  # in one order, so that both directions cost the same to the last bit
+            a, b, qa, qb = b, a, qb, qa
+        cost = self._kept.get((a, b))
         if cost is None:
             if len(self._kept) >= _MOST_KEPT:
                 self._kept.clear()
-            # In one order, so that both directions cost the same to the last bit.
-            cost = self._cost(qa, qb) if a <= b else self._cost(qb, qa)
-            self._kept[key] = cost
+            cost = self._kept[a, b] = self._cost(qa, qb)
         return cost
 
-    def state(self, q: Float[np.ndarray, " dof"]) -> float:
+    def state(self, q: Configuration) -> float:
         """Return the rate at one configuration."""
-        rates, touched, _ = self._sweep(q, q)
-        if self.kind == "joint":
-            return self._survival(touched)
-        return float(self._as_rates(rates)[0])
+        rates, joint, _ = self._sweep(q, q)
+        return joint if self.kind == "joint" else float(rates[0])
 
-    def worst(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+    def worst(self, qa: Configuration, qb: Configuration) -> float:
         """Return the largest rate at the samples of the straight motion, either way."""
         if self.kind == "joint":
             return self.motion(qa, qb)
         a, b = (qa, qb) if qa.tobytes() <= qb.tobytes() else (qb, qa)
-        rates, _, _ = self._sweep(a, b)
-        return float(self._as_rates(rates).max())
+        return float(self._sweep(a, b)[0].max())
 
     def _cost(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        rates, touched, way = self._sweep(qa, qb)
+        rates, joint, way = self._sweep(qa, qb)
         if self.kind == "joint":
-            return self._survival(touched)
+            return joint
         if len(rates) == 1 or not rates.any():
             return 0.0
-        values = self._as_rates(rates)
-        mean = (values.sum() - 0.5 * (values[0] + values[-1])) / (len(values) - 1)
+        mean = (rates.sum() - 0.5 * (rates[0] + rates[-1])) / (len(rates) - 1)
         return float(way * mean)
 
-    def _as_rates(self, values: np.ndarray) -> np.ndarray:
-        if self.kind != "survival":
-            return values
-        p = np.minimum(values / len(self._touched), self._ceiling)
-        return -np.log1p(-p)
-
-    def _survival(self, touched: int) -> float:
-        return -math.log1p(-min(touched / len(self._touched), self._ceiling))
-
-    def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, int, float]:
-        """Values at the samples, worlds touched anywhere, bound on the way in metres."""
+    def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Rates at the samples, -log of the share of worlds touched nowhere, bound on the way."""
         at, worlds = self._at, self._at.worlds
         steps, way, turned = kernels.plan_steps(
             qa, qb, at.floats, at.ints, self.spacing, self._delta, self._rates
@@ -147,7 +120,7 @@ class MotionRisk:
                 self._possible, self._corner, worlds.resolution, self._field[0], self._field[1],
                 self._directions, self.kind == "occupancy", values,
             )  # fmt: skip
-            return values, 0, way
+            return values, 0.0, way
         counts = np.empty(steps + 1, np.int64)
         scale, reach = worlds.scale
         while True:
@@ -159,9 +132,12 @@ class MotionRisk:
                 counts, self._touched, self._marks,
             )  # fmt: skip
             if not missing:
-                return counts, int(self._touched.sum()), way
+                break
             worlds.bake_marked(self._marks)
             self._marks = worlds.new_marks()
+        n = len(self._touched)
+        joint = -math.log1p(-min(int(self._touched.sum()) / n, self._ceiling))
+        return -np.log1p(-np.minimum(counts / n, self._ceiling)), joint, way
 
 
 def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
@@ -184,11 +160,12 @@ def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
     return worlds, lambda: worlds().sample(), lambda: _possible(worlds())
 
 
+Grid = tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]  # values, first index
 # Baking takes longer than many a search, so objectives over one map share it.
-_baked: WeakKeyDictionary[Any, dict[str, tuple[np.ndarray, np.ndarray]]] = WeakKeyDictionary()
+_baked: WeakKeyDictionary[Any, dict[str, Grid]] = WeakKeyDictionary()
 
 
-def _possible(worlds: Any) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]:
+def _possible(worlds: Any) -> Grid:
     """Distance, voxels, from voxel centres to the nearest that any draw may occupy; first index."""
     kept = _baked.setdefault(worlds, {})
     if "possible" not in kept:
@@ -208,9 +185,7 @@ def _possible(worlds: Any) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, 
     return kept["possible"]
 
 
-def _field(
-    worlds: Any, world: Any, kind: str
-) -> tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]:
+def _field(worlds: Any, world: Any, kind: str) -> Grid:
     """P(occupied), or entropy in nats, at the voxel centres of the posterior worlds."""
     kept = _baked.setdefault(worlds, {})
     if kind not in kept:
@@ -228,12 +203,3 @@ def _field(
         field[tuple(drawn.T)] = np.where(values < _LEAST, 0.0, values)
         kept[kind] = field, first
     return kept[kind]
-
-
-def _weights(at: Any, kind: str) -> Float[np.ndarray, " s"]:
-    """1 per sphere of the moving links, or its share of their volume."""
-    weights = (at.sphere_tables >= 0).astype(np.float64)
-    if kind == "entropy":
-        weights *= at.radii**3
-        weights /= max(float(weights.sum()), 1e-300)
-    return weights

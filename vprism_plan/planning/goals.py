@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Goals that are not a configuration: a pose of a link, a region that it shall reach."""
+"""Starts and goals: configurations, and poses and regions that become some; what is refused."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,14 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from vprism_plan.errors import PlanningError
-from vprism_plan.planning._inverse_kinematics import Targets, descend, find_tip, tip_poses
+from vprism_plan.errors import PlanningError, RobotError
+from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip
 from vprism_plan.planning.ompl_adapter import nearest_turns
+from vprism_plan.planning.path import one_line
+from vprism_plan.planning.protocols import CheckerLike, Configuration
+from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
+from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots._values import joint_values
 
 _APART = 0.05  # solutions nearer to each other in every joint are one
 
@@ -22,12 +28,11 @@ class PoseGoalConfig:
     """How a pose, or a region, becomes configurations.
 
     Attributes:
-        link: the link that is to reach the pose; the end of the robot's longest chain
-            if None. A `ReachRegion` names its own.
+        link: that is to reach the pose; one named like an end effector ("tcp", "tool0",
+            "hand", ...) if None. A `ReachRegion` names its own.
         attempts: number of random configurations the solver starts from.
         iterations: steps per attempt.
-        position_tolerance: metres between the link and the pose that still count as
-            reached.
+        position_tolerance: metres between the link and the pose that count as reached.
         rotation_tolerance: radians likewise.
         max_goals: how many valid configurations are handed to the planner at most.
     """
@@ -165,80 +170,59 @@ class ReachRegion:
 
 @dataclass(frozen=True)
 class GoalSolutions:
-    """Configurations found for a pose or a region.
+    """Configurations found for a pose or a region, of how many attempts."""
 
-    Attributes:
-        reached: distinct configurations that reach it (n, dof), nearest to the reference
-            first, whether or not a checker accepts them.
-        attempts: how many were tried.
-    """
-
-    reached: np.ndarray
+    reached: np.ndarray  # (n, dof) distinct, nearest to the reference first, not yet checked
     attempts: int
 
 
 def solve_pose(
-    robot: Any,
-    pose: Float[np.ndarray, "4 4"],
-    reference: Float[np.ndarray, " dof"],
-    seed: int,
-    config: PoseGoalConfig,
+    robot: Any, pose: np.ndarray, reference: Configuration, seed: int, config: PoseGoalConfig
 ) -> GoalSolutions:
-    """Find configurations that bring a link to a pose.
+    """Find configurations that bring a link to a pose (4, 4) in the world, metres.
 
-    From random starts within the joint limits, in float64, with mimic and continuous joints.
-    (pytorch-kinematics' solver reads its offsets in float32 and leaves mimic joints out:
-    `experiments.benchmarks.inverse_kinematics`.)
-
-    Args:
-        robot: with `arrays` and `link_poses`.
-        pose: wanted pose of the link in the world, metres.
-        reference: first start of the solver; solutions are sorted by their distance to it.
-        seed: of the random starts.
-        config: which link, tolerances, number of attempts.
-
-    Raises:
-        PlanningError: the pose is not a rigid transform, or the link is unknown.
+    From `reference`, and random starts within the joint limits, in float64, with mimic and
+    continuous joints. (pytorch-kinematics' solver reads its offsets in float32 and leaves mimic
+    joints out: `experiments.benchmarks.inverse_kinematics`.) Raises PlanningError if the pose
+    is not a rigid transform, or the link is unknown.
     """
     require_rigid(pose, "goal pose")
-    rng = np.random.default_rng(seed)
-    tip = find_tip(robot, config.link, np.random.default_rng(seed))
     n = config.attempts
     targets = Targets(np.tile(pose[:3, 3], (n, 1)), np.tile(pose[:3, :3], (n, 1, 1)))
-    q, away, turn = descend(
-        robot, tip, targets, _starts(robot, reference, n, rng), config.iterations
-    )
+    _, q, away, turn = _descended(robot, config.link, lambda _: targets, reference, seed, config)
     good = (away <= config.position_tolerance) & (turn <= config.rotation_tolerance)
     return GoalSolutions(_distinct(robot, q[good], reference), n)
 
 
 def solve_region(
-    robot: Any,
-    region: ReachRegion,
-    reference: Float[np.ndarray, " dof"],
-    seed: int,
-    config: PoseGoalConfig,
+    robot: Any, region: ReachRegion, reference: Configuration, seed: int, config: PoseGoalConfig
 ) -> GoalSolutions:
     """Find configurations that bring a link into a region; arguments as `solve_pose`."""
+    n, link = config.attempts, region.link or config.link
+    tip, q, _, _ = _descended(robot, link, lambda rng: region.draw(n, rng), reference, seed, config)
+    good = region.contains(*tip.behind(*frame_poses(robot.arrays, q)))
+    return GoalSolutions(_distinct(robot, q[good], reference), n)
+
+
+def _descended(
+    robot: Any,
+    link: str | None,
+    draw: Callable[[np.random.Generator], Targets],
+    reference: Configuration,
+    seed: int,
+    config: PoseGoalConfig,
+) -> tuple[Tip, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the link, and what `descend` makes of the reference and random starts."""
     rng = np.random.default_rng(seed)
-    tip = find_tip(robot, region.link or config.link, np.random.default_rng(seed))
-    starts = _starts(robot, reference, config.attempts, rng)
-    targets = region.draw(config.attempts, rng)
-    q, _, _ = descend(robot, tip, targets, starts, config.iterations)
-    good = region.contains(*tip_poses(robot, tip, q))
-    return GoalSolutions(_distinct(robot, q[good], reference), config.attempts)
-
-
-def _starts(
-    robot: Any, reference: Float[np.ndarray, " dof"], n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "n dof"]:
-    q = rng.uniform(np.asarray(robot.lower), np.asarray(robot.upper), (n, robot.dof))
-    q[0] = reference
-    return q
+    tip = find_tip(robot, link, np.random.default_rng(seed))
+    lower, upper = np.asarray(robot.lower), np.asarray(robot.upper)
+    starts = rng.uniform(lower, upper, (config.attempts, robot.dof))
+    starts[0] = reference
+    return tip, *descend(robot, tip, draw(rng), starts, config.iterations)
 
 
 def _distinct(
-    robot: Any, q: Float[np.ndarray, "n dof"], reference: Float[np.ndarray, " dof"]
+    robot: Any, q: Float[np.ndarray, "n dof"], reference: Configuration
 ) -> Float[np.ndarray, "m dof"]:
     """Drop near duplicates, and whole turns; nearest to the reference first."""
     q = nearest_turns(q, reference, np.asarray(robot.continuous, dtype=bool))
@@ -264,3 +248,100 @@ def require_rigid(pose: np.ndarray, what: str) -> None:
             f"{what} {pose.tolist()} is not a rigid transform; it needs an orthonormal rotation "
             "with determinant 1, a translation in metres and the last row 0 0 0 1"
         )
+
+
+def configuration(q: Any, robot: Any, what: str) -> Configuration:
+    """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
+    array = _numbers(q, robot, what)
+    if array.shape != (robot.dof,):
+        raise PlanningError(
+            f"{what} has shape {array.shape}; it must be ({robot.dof},), one value per joint: "
+            f"{', '.join(robot.joint_names)}"
+        )
+    if not np.isfinite(array).all():
+        raise PlanningError(f"{what} is {array}; every joint value must be finite")
+    return array
+
+
+def _numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
+    """Return a fresh float64 copy, or raise PlanningError naming what cannot be read."""
+    try:
+        return joint_values(values, robot, what)
+    except RobotError as error:
+        raise PlanningError(str(error)) from error
+
+
+def refuse(
+    checker: CheckerLike, q: Configuration, what: str, report: PlanReport
+) -> PlanResult | None:
+    """Return the refusal if q must not be used as start or goal, None if it may."""
+    robot = checker.robot
+    # The limits are checked here too: outside them OMPL would refuse without a reason.
+    bad = ~np.asarray(robot.continuous, dtype=bool) & ((q < robot.lower) | (q > robot.upper))
+    if not bad.any() and checker.is_valid(q):
+        return None
+    outside = ", ".join(
+        f"joint {robot.joint_names[i]} is {q[i]:.6g}, outside [{robot.lower[i]:.6g}, "
+        f"{robot.upper[i]:.6g}]"
+        for i in np.flatnonzero(bad)
+    )
+    explanation = checker.explain(q)
+    reasons = outside if explanation.valid else one_line(explanation)
+    status: Any = f"invalid_{what}"
+    message = f"{what} is invalid: {reasons}"
+    return PlanResult(None, status, report, message, explanation=explanation)
+
+
+def valid_goals(
+    checker: CheckerLike,
+    goal: Any,
+    start: Configuration,
+    config: PoseGoalConfig,
+    report: PlanReport,
+) -> tuple[Float[np.ndarray, "g dof"], PlanReport] | PlanResult:
+    """Return valid goal configurations (g, dof) and the report of the others, or the refusal.
+
+    Of those that reach a pose or a region as many are kept as `config` allows, of those that
+    the caller gave all.
+    """
+    robot = checker.robot
+    array = np.empty(0) if isinstance(goal, ReachRegion) else _numbers(goal, robot, "goal")
+    if isinstance(goal, ReachRegion):
+        what, found = "region", solve_region(robot, goal, start, report.seed, config)
+    elif array.shape == (4, 4) and (robot.dof != 4 or array[3].tolist() == [0.0, 0.0, 0.0, 1.0]):
+        what, found = "pose", solve_pose(robot, array, start, report.seed, config)
+    elif array.ndim == 2 and len(array) > 0 and array.shape[1] == robot.dof:
+        rows = np.stack([configuration(q, robot, f"goal {k}") for k, q in enumerate(array)])
+        what, found = "", GoalSolutions(rows, len(rows))
+    else:
+        q = configuration(array, robot, "goal")
+        refusal = refuse(checker, q, "goal", report)
+        return (q[None], report) if refusal is None else refusal
+    if len(found.reached) == 0:
+        message = (
+            "goal is invalid: no configuration within the joint limits reaches the "
+            f"{what} ({found.attempts} attempts)"
+        )
+        return PlanResult(None, "invalid_goal", report, message)
+    good: list[np.ndarray] = []
+    refused: list[PlanResult] = []
+    notes: list[RefusedGoal] = []
+    most = config.max_goals if what else len(found.reached)
+    for q in found.reached:
+        refusal = refuse(checker, q, "goal", report)
+        if refusal is None:
+            good.append(q)
+        else:
+            refused.append(refusal)
+            reason = refusal.message.removeprefix("goal is invalid: ")
+            notes.append(RefusedGoal(tuple(q.tolist()), reason))
+        if len(good) == most:
+            break
+    report = replace(report, refused_goals=tuple(notes))
+    if good:
+        return np.array(good), report
+    said = f"found for the goal {what}" if what else "given as goals"
+    message = (
+        f"all {len(found.reached)} configurations {said} are invalid, the first: {notes[0].reason}"
+    )
+    return replace(refused[0], report=report, message=message)

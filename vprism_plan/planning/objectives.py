@@ -15,13 +15,12 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning._motion_risk import KINDS, MotionRisk, preparation
-from vprism_plan.planning._spaces import StateReader
-from vprism_plan.planning.ompl_adapter import nearest_turns
+from vprism_plan.planning.ompl_adapter import StateReader, nearest_turns
+from vprism_plan.planning.protocols import Configuration, Waypoints
 
 # Rates (n,) per metre at configurations (n, dof).
 Rates = Callable[[np.ndarray], np.ndarray]
@@ -35,9 +34,8 @@ class RiskObjective:
         kind: "joint", "survival", "occupancy", "entropy" or a function; see
             `VPrismRiskObjective`.
         spacing: metres of sphere motion between samples of a motion.
-        length_weight: cost of a unit of path length (the state space's distance, radians
-            and metres alike), beside the risk. It also is what informed sampling and
-            pruning work with: without it they have no bound to use.
+        length_weight: cost of a unit of path length (the state space's distance, radians and
+            metres alike), beside the risk; the bound that informed sampling and pruning use.
         worst: make the largest rate of any state on the path small in place of the sum
             (`VPrismMinimaxRiskObjective`); length then does not count.
     """
@@ -52,8 +50,12 @@ class RiskObjective:
             raise PlanningError(
                 f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}, or a function"
             )
-        _require_weight(self.length_weight)
-        _require_spacing(self.spacing)
+        if not (math.isfinite(self.length_weight) and self.length_weight >= 0.0):
+            raise PlanningError(
+                f"length_weight is {self.length_weight!r}; it must be finite and at least 0"
+            )
+        if not (math.isfinite(self.spacing) and self.spacing > 0.0):
+            raise PlanningError(f"spacing is {self.spacing!r}; it must be finite and more than 0")
 
     @property
     def name(self) -> str:
@@ -73,37 +75,24 @@ class RiskObjective:
         return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
 
 
-def _require_weight(value: Any) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
-        raise PlanningError(f"length_weight is {value!r}; it must be finite and at least 0")
-
-
-def _require_spacing(value: Any) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise PlanningError(f"spacing is {value!r}; it must be finite and more than 0")
-
-
 class _FunctionRisk:
     """`MotionRisk` for rates that a user's function gives; "metres" are those of joint space."""
 
     def __init__(self, rates: Rates, spacing: float) -> None:
-        _require_spacing(spacing)
-        self.kind = "function"
-        self._rates = rates
-        self._spacing = spacing
+        self._rates, self._spacing = rates, spacing
 
-    def samples(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float]:
+    def _samples(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float]:
         """Return rates at equal steps of a motion, and its length."""
         way = float(np.linalg.norm(qb - qa))
         t = np.linspace(0.0, 1.0, max(1, math.ceil(way / self._spacing)) + 1)[:, None]
         return self._checked(qa + t * (qb - qa)), way
 
     def motion(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        values, way = self.samples(qa, qb)
+        values, way = self._samples(qa, qb)
         return way * float(np.mean(0.5 * (values[1:] + values[:-1])))
 
     def worst(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        return float(np.max(self.samples(qa, qb)[0]))
+        return float(np.max(self._samples(qa, qb)[0]))
 
     def state(self, q: np.ndarray) -> float:
         return float(self._checked(q[None])[0])
@@ -128,12 +117,8 @@ class _FunctionRisk:
 class PathCost:
     """What motions, and the paths they make up, cost by a risk objective; without OMPL.
 
-    Args:
-        checker: a `CollisionChecker` over a `World`; with a function anything with `robot`.
-        kind: of risk, or a function.
-        spacing: metres of sphere motion between samples.
-        length_weight: cost of a unit of length, see `VPrismRiskObjective`.
-        worst: whether the worst state counts alone.
+    `checker` is a `CollisionChecker` over a `World`, with a function anything with `robot`; the
+    other arguments are those of `RiskObjective`.
     """
 
     def __init__(
@@ -144,8 +129,8 @@ class PathCost:
         length_weight: float = 1e-3,
         worst: bool = False,
     ) -> None:
-        _require_weight(length_weight)
-        self.risk: Any = (
+        RiskObjective(kind, spacing, length_weight, worst)  # refuses what is out of range
+        self.risk: MotionRisk | _FunctionRisk = (
             MotionRisk(checker, kind, spacing)
             if isinstance(kind, str)
             else _FunctionRisk(kind, spacing)
@@ -154,14 +139,13 @@ class PathCost:
         self.worst = worst
         self._wraps = np.asarray(checker.robot.continuous, dtype=bool)
 
-    def edge(self, qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"]) -> float:
+    def edge(self, qa: Configuration, qb: Configuration) -> float:
         """Return the cost of a straight motion; continuous joints turn as the difference says."""
         if self.worst:
             return float(self.risk.worst(qa, qb))
-        risk = float(self.risk.motion(qa, qb))
-        return risk + self.length_weight * space_distance(qa, qb, self._wraps)
+        return float(self.risk.motion(qa, qb)) + self.length_weight * self._distance(qb - qa)
 
-    def path(self, path: Float[np.ndarray, "t dof"]) -> float:
+    def path(self, path: Waypoints) -> float:
         """Return the cost of a path: the sum, or the largest, of its edges'."""
         return self.combined([self.edge(a, b) for a, b in pairwise(path)])
 
@@ -169,20 +153,17 @@ class PathCost:
         """Return what motions in a row cost together."""
         return max(costs, default=0.0) if self.worst else float(sum(costs))
 
-
-def space_distance(
-    qa: Float[np.ndarray, " dof"], qb: Float[np.ndarray, " dof"], wraps: Bool[np.ndarray, " dof"]
-) -> float:
-    """Length of a straight motion in `state_space`: Euclidean over each run of limited joints,
-    the angle for each continuous one, all summed."""
-    step = np.abs(qb - qa)
-    if not wraps.any():
-        return float(np.linalg.norm(step))
-    total = float(step[wraps].sum())
-    ends = np.flatnonzero(np.diff(np.concatenate([[True], wraps, [True]]).astype(int)))
-    for begin, end in zip(ends[::2], ends[1::2], strict=True):
-        total += float(np.linalg.norm(step[begin:end]))
-    return total
+    def _distance(self, step: Configuration) -> float:
+        """Length in `state_space`: Euclidean over each run of limited joints, the angle of each
+        continuous one, all summed."""
+        wraps, step = self._wraps, np.abs(step)
+        if not wraps.any():
+            return float(np.linalg.norm(step))
+        total = float(step[wraps].sum())
+        ends = np.flatnonzero(np.diff(np.concatenate([[True], wraps, [True]]).astype(int)))
+        for begin, end in zip(ends[::2], ends[1::2], strict=True):
+            total += float(np.linalg.norm(step[begin:end]))
+        return total
 
 
 class _RiskBase(ob.OptimizationObjective):
@@ -190,16 +171,13 @@ class _RiskBase(ob.OptimizationObjective):
 
     def __init__(self, si: Any, checker: Any, cost: PathCost) -> None:
         super().__init__(si)
-        space = si.getStateSpace()
         self._cost = cost
-        self._reader = StateReader(space, checker.robot.dof)
-        self._distance = space.distance
-        self._wraps = np.array(self._reader.wraps)
-        self._any_wraps = bool(self._wraps.any())
+        self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
+        self._distance = si.getStateSpace().distance
 
     def _ends(self, s1: Any, s2: Any) -> tuple[np.ndarray, np.ndarray]:
         qa, qb = self._reader.read_pair(s1, s2)
-        return (qa, nearest_turns(qb, qa, self._wraps)) if self._any_wraps else (qa, qb)
+        return qa, nearest_turns(qb, qa, self._reader.wraps)
 
     def stateCost(self, state: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the rate at a state."""
@@ -212,12 +190,12 @@ class VPrismRiskObjective(_RiskBase):
     cost(path) = sum over its motions of (risk of the motion + length_weight * length).
 
     Kinds of risk; p is a share of the checker's posterior worlds:
-        "joint": -log(1 - p), p that the motion touches anything, in the same world from its
-            beginning to its end. Closest to the risk of the whole path: the sum over the
-            path counts twice only what touches on two of its motions.
+        "joint": -log(1 - p), p that the motion touches anything, in the same world all along.
+            Closest to the risk of the whole path: the sum over the path counts twice only
+            what touches on two of its motions.
         "survival": integral along the motion, per metre, of -log(1 - p(q)), p(q) that the
-            robot touches anything at q. What touches one object over 10 cm costs ten times
-            what touches it over 1 cm, although the risk may be the same.
+            robot touches anything at q. An object touched over 10 cm costs ten times as much
+            as over 1 cm, although the risk may be the same.
         "occupancy": integral of the sum over spheres of the largest P(occupied) in each.
         "entropy": integral of the mean entropy in the robot's volume, nats. Both know no
             allowed contacts, and are 0 (occupancy: or 1) where all posterior worlds agree.
@@ -283,9 +261,8 @@ class VPrismMinimaxRiskObjective(_RiskBase):
         spacing: float = 0.02,
         cost: PathCost | None = None,
     ) -> None:
-        super().__init__(
-            si, checker, PathCost(checker, kind, spacing, 0.0, True) if cost is None else cost
-        )
+        cost = PathCost(checker, kind, spacing, 0.0, True) if cost is None else cost
+        super().__init__(si, checker, cost)
 
     def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
         """Return the largest rate on the straight motion between two states."""

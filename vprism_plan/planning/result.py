@@ -7,14 +7,9 @@ from typing import Any, Literal
 import numpy as np
 
 Status = Literal[
-    "exact",
-    "approximate",
-    "timeout",
-    "invalid_start",
-    "invalid_goal",
-    "verification_failed",
+    "exact", "approximate", "timeout", "invalid_start", "invalid_goal", "verification_failed",
     "too_risky",
-]
+]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,45 +54,37 @@ class PlanReport:
         verification_time: seconds spent re-checking the final waypoints.
         state_checks: states whose validity was asked for, start and goal included.
         motion_checks: motions that were checked, verification included.
-        path_length: Euclidean length of the path in joint space (radians and metres
-            alike), NaN without a path.
+        path_length: Euclidean, in joint space (radians and metres alike), NaN without a path.
         waypoints: number of rows of the path, 0 without one.
-        min_clearance: smallest `checker.clearance` at the samples along the path,
-            metres, NaN without a path. A sampled value: the path's safety rests on the
-            continuous re-verification, not on it.
-        clearance_samples: number of those samples.
-        searches: how often the planner ran; more than once if a path it accepted failed
-            verification, each time with another seed derived from the given one.
+        min_clearance: smallest `checker.clearance` at `clearance_samples` along the path,
+            metres, NaN without a path; the path's safety rests on its verification, not on it.
+        clearance_samples: their number.
+        searches: how often the planner ran; again, with another seed derived from the given
+            one, where a path it accepted failed verification.
         direct: whether the straight motion to the goal was valid, so that no search ran.
-        goal_index: which of several goal configurations (those given, or the solutions of a
-            pose or a region, without those refused) was reached, None if none was.
-        refused_goals: which of them were refused, and why. Solutions of a pose or a region
-            are tried, nearest to the start first, until there are enough.
-        certified: whether every edge was covered by computed clearances, with nothing
-            left to sampling.
+        goal_index: which of several goal configurations (given, or solutions of a pose or a
+            region; without those refused) was reached, None if none was.
+        refused_goals: which were refused, and why. Solutions of a pose or a region are tried,
+            nearest to the start first, until there are enough.
+        certified: whether computed clearances cover every edge, with nothing left to sampling.
         tolerance: largest motion, metres, between a point of the path and a
             configuration known to be free (0 when certified), NaN without a path.
-        shares: largest share of the robot's volume, at the waypoints, that lies in each
-            kind of unseen space ("occluded", "unobserved", ...); what the checker
-            reports, empty if it reports nothing.
-        second_opinion: what another judge says of the verified path (`valid`, `text()`,
-            with `MeshChecker` a `PathOpinion` that says who disagrees, where and why);
-            None if nobody was asked or there is no path.
+        shares: largest share of the robot's volume, at the waypoints, in each kind of unseen
+            space ("occluded", "unobserved", ...) that the checker reports.
+        second_opinion: what another judge says of the verified path (`valid`, `text()`; of
+            `MeshChecker` a `PathOpinion`); None if nobody was asked or there is no path.
         second_opinion_time: seconds that took.
         risk: joint probability that the path collides, by worlds the search has not seen
             (a `RiskEstimate`); None if the checker has no `max_risk`, or without a path.
-        risk_levels: how often the bound was tightened because a path was within it edge by
-            edge, but not as a whole.
+        risk_levels: how often the bound was tightened: edges were within it, the path was not.
         risk_time: seconds spent on those estimates.
-        allowed_contacts: contacts that the rules permit, at the last waypoint: what the
-            robot ends touching (`Contact`s).
+        allowed_contacts: permitted `Contact`s at the last waypoint.
         clock: what all these seconds were measured by: "wall" or "process" (processor time).
         objective: what the search made small: "length", or the kind of risk.
         objective_time: seconds that preparing it took: worlds drawn and baked, the first time.
         cost: of the path by that objective (`path_length` for "length"); NaN without a path.
-        history: the best path each time it had become noticeably better, the last one as it
-            was before it was shortened; only of planners that report their cost and resume
-            (see `planners`).
+        history: the best path each time it had become noticeably better, not yet shortened;
+            only of planners that report their cost and resume (see `planners`).
     """
 
     planner: str
@@ -137,22 +124,19 @@ class PlanResult:
     """The verdict on a planning query.
 
     Attributes:
-        path: verified waypoints (T, dof), radians and metres, start first; None unless
-            the status is "exact". Continuous joints are unwrapped: consecutive rows
-            differ by the motion that was checked, so the last row equals the goal up to
-            whole turns of those joints.
+        path: verified waypoints (T, dof), radians and metres, start first; None unless the
+            status is "exact". Consecutive rows differ by the motion that was checked, so the
+            last row equals the goal up to whole turns of continuous joints.
         status: "exact" (path reaches the goal and every edge was re-verified),
             "approximate" (ended near the goal only), "timeout" (nothing found),
             "invalid_start", "invalid_goal", "verification_failed", "too_risky" (every edge
             is within `max_risk`, the whole path is not).
         report: the numbers.
         message: one line for people: what happened and why.
-        approximate_path: waypoints that do NOT solve the query: of an approximate
-            solution, those that failed verification, or the least risky ones that are too
-            risky. None otherwise.
+        approximate_path: waypoints that do NOT solve the query: approximate, refused by the
+            verification, or the least risky ones that are too risky. None otherwise.
         explanation: the checker's `explain` report for an invalid start or goal, or its
-            `check_motion_report` for the first edge that failed verification, None
-            otherwise.
+            `check_motion_report` for the first edge that failed verification. None otherwise.
         warnings: what is usable but odd about the world and the robot (`checker.warnings`).
     """
 

@@ -4,23 +4,32 @@
 The checker certified straight lines in joint space. Blending corners would leave them,
 so the motion stops where the direction changes, and nowhere else. Between stops all
 joints share one trapezoidal profile along the line.
+
+Files hold `trajectory_msgs/JointTrajectory` in JSON.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from vprism_plan._files import read_json, reading, write_text
+from vprism_plan._numbers import is_whole
 from vprism_plan.errors import PlanningError
+from vprism_plan.planning.protocols import Configuration
 
 # Without stated acceleration limits a joint reaches its full speed in this time.
 _SECONDS_TO_FULL_SPEED = 0.5
 # Unit directions closer than this are one line; the path is left by no more.
 _SAME_DIRECTION = 1e-9
+_NANOSECONDS = 10**9
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +84,11 @@ def time_parameterize(
         robot: brings `joint_names` and the default `velocity_limits`.
         path: waypoints (t, dof), at least one, as in `PlanResult.path`.
         velocity_limits: (dof,) rad/s or m/s; the robot's own if None.
-        acceleration_limits: (dof,) per second squared; if None, each joint reaches its
-            velocity limit in half a second.
+        acceleration_limits: (dof,) per s^2; None: each joint is at full speed in half a second.
         scale: share of both limits to use, more than 0 and at most 1.
 
     Returns:
-        The trajectory: at rest at both ends and at every corner of the path, on the
-        path throughout, through every waypoint.
+        At rest at both ends and at every corner; on the path, through every waypoint.
 
     Raises:
         PlanningError: the path or a limit is not usable; names the joint and the value.
@@ -89,10 +96,8 @@ def time_parameterize(
     path = np.asarray(path, dtype=np.float64)
     names = tuple(robot.joint_names)
     if path.ndim != 2 or path.shape[1] != len(names) or len(path) == 0:
-        raise PlanningError(
-            f"path has shape {path.shape}; it must be (waypoints, {len(names)}) with at least "
-            "one waypoint"
-        )
+        needed = f"it must be (waypoints, {len(names)}) with at least one waypoint"
+        raise PlanningError(f"path has shape {path.shape}; {needed}")
     if not np.isfinite(path).all():
         raise PlanningError("the path holds NaN or infinite values")
     if not 0.0 < scale <= 1.0:
@@ -103,17 +108,15 @@ def time_parameterize(
     if acceleration_limits is not None:
         push = _limits("acceleration", acceleration_limits, names)
 
-    times, positions, velocities = [0.0], [path[0]], [np.zeros(len(names))]
+    points = [(0.0, path[0], np.zeros(len(names)))]
     for line in _straight_lines(path):
-        began = times[-1]
-        for t, q, v in _timed(line, scale * speed, scale * push):
-            times.append(began + t)
-            positions.append(q)
-            velocities.append(v)
-    return Trajectory(np.array(times), np.array(positions), np.array(velocities))
+        began = points[-1][0]
+        points += [(began + t, q, v) for t, q, v in _timed(line, scale * speed, scale * push)]
+    times, positions, velocities = map(np.array, zip(*points, strict=True))
+    return Trajectory(times, positions, velocities)
 
 
-def _limits(kind: str, values: ArrayLike, names: tuple[str, ...]) -> Float[np.ndarray, " dof"]:
+def _limits(kind: str, values: ArrayLike, names: tuple[str, ...]) -> Configuration:
     limits = np.asarray(values, dtype=np.float64)
     if limits.shape != (len(names),):
         raise PlanningError(
@@ -143,9 +146,7 @@ def _straight_lines(path: Float[np.ndarray, "t dof"]) -> Iterator[Float[np.ndarr
 
 
 def _timed(
-    line: Float[np.ndarray, "k dof"],
-    speed: Float[np.ndarray, " dof"],
-    push: Float[np.ndarray, " dof"],
+    line: Float[np.ndarray, "k dof"], speed: Configuration, push: Configuration
 ) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield (time, position, velocity) along a line, its start left out.
 
@@ -158,40 +159,107 @@ def _timed(
     v, a = float(np.min(speed[moving] / size)), float(np.min(push[moving] / size))
     ramp = min(v / a, math.sqrt(1.0 / a))
     top = a * ramp
-    cruise = 1.0 / top - ramp
+    rate, cruise = top / ramp, 1.0 / top - ramp
     total = cruise + 2.0 * ramp
+
+    def profile(t: float) -> tuple[float, float]:
+        """Return s and s' of the trapezoid at time t."""
+        if t <= ramp:
+            return 0.5 * rate * t * t, rate * t
+        if t < total - ramp:
+            return top * (t - 0.5 * ramp), top
+        left = total - t
+        return 1.0 - 0.5 * rate * left * left, rate * left
+
+    def time_at(s: float) -> float:
+        """Return the time at which the trapezoid reaches s."""
+        if s <= 0.5 * top * ramp:
+            return math.sqrt(2.0 * s / rate)
+        if s <= 1.0 - 0.5 * top * ramp:
+            return s / top + 0.5 * ramp
+        return total - math.sqrt(2.0 * (1.0 - s) / rate)
+
     inner = np.linalg.norm(line[1:-1] - line[0], axis=1) / np.linalg.norm(whole)
-    events = [
-        (_time_at(float(s), ramp, top, total), q) for s, q in zip(inner, line[1:-1], strict=True)
-    ]
+    events = [(time_at(float(s)), q) for s, q in zip(inner, line[1:-1], strict=True)]
     knees = [ramp] if cruise <= 1e-9 * total else [ramp, ramp + cruise]
-    events += [(t, line[0] + _profile(t, ramp, top, total)[0] * whole) for t in knees]
+    events += [(t, line[0] + profile(t)[0] * whole) for t in knees]
     events.sort(key=lambda event: event[0])
     previous = 0.0
     for t, q in events:
         # A knee that falls on a waypoint is one point, not two.
         if t - previous > 1e-9 * total and total - t > 1e-9 * total:
-            yield t, q, _profile(t, ramp, top, total)[1] * whole
+            yield t, q, profile(t)[1] * whole
             previous = t
     yield total, line[-1], 0.0 * whole
 
 
-def _profile(t: float, ramp: float, top: float, total: float) -> tuple[float, float]:
-    """Return s and s' of the trapezoid at time t."""
-    rate = top / ramp
-    if t <= ramp:
-        return 0.5 * rate * t * t, rate * t
-    if t < total - ramp:
-        return top * (t - 0.5 * ramp), top
-    left = total - t
-    return 1.0 - 0.5 * rate * left * left, rate * left
+def write_trajectory(
+    path_file: str | Path, robot: Any, trajectory: Trajectory, frame_id: str = ""
+) -> None:
+    """Write a trajectory as `trajectory_msgs/JointTrajectory`, whole or not at all.
+
+    Accelerations and efforts stay empty, which the message allows: given accelerations,
+    controllers fit quintics, which a trapezoidal profile is not. Joint motions need no
+    `frame_id`. The robot brings `joint_names`, in the order of the columns.
+
+    Raises:
+        PlanningError: joints and columns differ in number, or two points fall on the
+            same nanosecond.
+    """
+    names = [str(name) for name in robot.joint_names]
+    if trajectory.positions.shape[1:] != (len(names),):
+        raise PlanningError(
+            f"the trajectory has {trajectory.positions.shape[1:]} joints, the robot {len(names)}: "
+            f"{', '.join(names)}"
+        )
+    ticks = [round(float(t) * _NANOSECONDS) for t in trajectory.times]
+    if any(b <= a for a, b in pairwise(ticks)):
+        raise PlanningError("points of the trajectory are less than a nanosecond apart")
+    points = [
+        {
+            "positions": q.tolist(),
+            "velocities": v.tolist(),
+            "accelerations": [],
+            "effort": [],
+            "time_from_start": {"sec": tick // _NANOSECONDS, "nanosec": tick % _NANOSECONDS},
+        }
+        for tick, q, v in zip(ticks, trajectory.positions, trajectory.velocities, strict=True)
+    ]
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
+    message = {"header": header, "joint_names": names, "points": points}
+    write_text(path_file, json.dumps(message, indent=1, allow_nan=False) + "\n")
 
 
-def _time_at(s: float, ramp: float, top: float, total: float) -> float:
-    """Return the time at which the trapezoid reaches s."""
-    rate = top / ramp
-    if s <= 0.5 * top * ramp:
-        return math.sqrt(2.0 * s / rate)
-    if s <= 1.0 - 0.5 * top * ramp:
-        return s / top + 0.5 * ramp
-    return total - math.sqrt(2.0 * (1.0 - s) / rate)
+def read_trajectory(path_file: str | Path) -> tuple[tuple[str, ...], Trajectory]:
+    """Read what `write_trajectory` wrote: joint names and the trajectory.
+
+    Raises:
+        PlanningError: the file is missing or is not such a message.
+    """
+    path = Path(path_file)
+    message = read_json(path, PlanningError)
+    with reading(path, "readable as trajectory_msgs/JointTrajectory", PlanningError):
+        names = tuple(str(name) for name in message["joint_names"])
+        points = message["points"]
+        ticks = [_ticks(p["time_from_start"]) for p in points]
+        times, wrong = np.array(ticks, dtype=np.float64) / _NANOSECONDS, ""
+        positions, velocities = (
+            np.array([p[key] for p in points], np.float64).reshape(len(points), len(names))
+            for key in ("positions", "velocities")
+        )
+        if len(times) == 0:
+            wrong = "it has no points"
+        elif not all(np.isfinite(value).all() for value in (times, positions, velocities)):
+            wrong = "some of its values are not finite"
+        elif times[0] < 0.0 or not (np.diff(times) > 0.0).all():
+            wrong = "its times must rise, from 0 or later"
+        if wrong:
+            raise PlanningError(f"{path} is no motion: {wrong}")
+        return names, Trajectory(times, positions, velocities)
+
+
+def _ticks(time: Any) -> int:
+    parts = time["sec"], time["nanosec"]
+    if not all(is_whole(part) for part in parts):  # a text times a billion fills the memory
+        raise ValueError(f"time_from_start is {time!r}; sec and nanosec must be whole numbers")
+    return int(parts[0] * _NANOSECONDS + parts[1])

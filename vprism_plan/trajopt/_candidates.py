@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 
 from vprism_plan.planning import CheckerLike
-from vprism_plan.planning._verify import interpolated, one_line, verified
+from vprism_plan.planning.path import interpolated, one_line, verified
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.trajopt._minimize import REASONS, Limits, Minimum, adam, lbfgs
 from vprism_plan.trajopt._seeds import Seeds, smooth_basis

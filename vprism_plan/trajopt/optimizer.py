@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
-from vprism_plan.planning._query import configuration, refuse
-from vprism_plan.planning._risk import within_risk
-from vprism_plan.planning._runtime import checked_seed
+from vprism_plan.planning.attempts import within_risk
+from vprism_plan.planning.goals import configuration, refuse
 from vprism_plan.planning.result import PlanReport, PlanResult
+from vprism_plan.planning.search import checked_seed
 from vprism_plan.trajopt._candidates import Candidates, Settings, path_clearance
 from vprism_plan.trajopt._default_cost import Defaults, has_world
 from vprism_plan.trajopt._seeds import make_seeds

@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What planning needs from a robot and from a checker.
+"""What planning needs from a robot, from a checker and from a second judge.
 
 `vprism_plan.collision.CollisionChecker` satisfies `CheckerLike`; so does any other
 object with these members, which is how the adapter is tested and how a user brings
 a checker of their own.
 """
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+# Radians or metres, in the order of the robot's joints; rows of any number.
+Configuration = Float[np.ndarray, " dof"]
+Waypoints = Float[np.ndarray, "_ dof"]
+Now = Callable[[], float]  # reads a clock, seconds
 
 
 @runtime_checkable
@@ -43,7 +49,9 @@ class CheckerLike(Protocol):
 
     The two `*_buffer` forms take float64 C-contiguous arrays of length dof and skip
     all validation except that NaN is never valid; they must be safe to call from
-    several threads.
+    several threads. With `max_risk`, a bound on the probability of collision that is not
+    None, `collision_probability(path, held_out=True)` and `tightened(level)` are asked, too;
+    see `attempts.within_risk`.
     """
 
     @property
@@ -69,25 +77,11 @@ class CheckerLike(Protocol):
         """Metres to the nearest obstacle, negative inside one."""
 
     def explain(self, q: Any) -> Any:
-        """A `ReasonedReport` on a configuration."""
+        """A report on a configuration: `valid`, `text()`, and `shares`, the part of the robot's
+        volume in each kind of unseen space."""
 
     def check_motion_report(self, qa: Any, qb: Any) -> Any:
-        """A report on a motion: `valid`, `certified`, `tolerance` (metres) and `text()`."""
-
-
-@runtime_checkable
-class RiskChecker(CheckerLike, Protocol):
-    """A checker that bounds the probability of collision."""
-
-    @property
-    def max_risk(self) -> float | None:
-        """Bound on the probability of collision, None for no bound."""
-
-    def collision_probability(self, path: Any, held_out: bool = False) -> Any:
-        """A `RiskEstimate` of a path (T, dof); `held_out`: by worlds no verdict has seen."""
-
-    def tightened(self, level: int) -> Any:
-        """The same checker with a stricter bound, None if there is none."""
+        """`check_motion` with reasons: `valid`, `certified`, `tolerance` (metres), `text()`."""
 
 
 @runtime_checkable
@@ -100,19 +94,3 @@ class SecondOpinion(Protocol):
 
     def review(self, checker: Any, path: Any) -> Any:
         """An opinion on a path (T, dof) that `checker` accepted: `valid` and `text()`."""
-
-
-@runtime_checkable
-class ReasonedReport(Protocol):
-    """A verdict on a configuration that can say why, and what nobody has seen."""
-
-    @property
-    def valid(self) -> bool:
-        """The verdict."""
-
-    @property
-    def shares(self) -> dict[str, float]:
-        """Share of the robot's volume per kind of unseen space."""
-
-    def text(self) -> str:
-        """The verdict in one line."""

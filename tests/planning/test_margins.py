@@ -10,10 +10,11 @@ from oracles.checker_oracle import BallWorld
 
 import vprism_plan as vp
 from vprism_plan.errors import ConfigError, PlanningError
-from vprism_plan.planning import plan, plan_widest
+from vprism_plan.planning import plan
 
 URDF = Path(__file__).resolve().parents[2] / "urdf" / "planar3.urdf"
 START, GOAL = np.array([0.6, 0.3, 0.2]), np.array([-0.6, -0.3, -0.2])
+LADDER = (0.02, 0.01, 0.005, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def torch_of(q):
 @pytest.mark.parametrize(("gap", "kept"), [(0.045, 0.02), (0.016, 0.01), (0.004, 0.0)])
 def test_the_widest_margin_that_works_is_kept(robot, gap, kept):
     checker = checker_with_ball(robot, gap)
-    result = plan_widest(checker, START, GOAL, extra=(0.02, 0.01, 0.0), seed=1)
+    result = plan(checker, START, GOAL, margins=(0.02, 0.01, 0.0), seed=1)
     assert result.solved, result.message
     assert f"kept {1000 * kept:g} mm beyond" in result.message
     strict = checker.with_extra_margin(kept)
@@ -54,7 +55,7 @@ def test_the_widest_margin_that_works_is_kept(robot, gap, kept):
 
 def test_without_any_way_the_most_permissive_answer_is_given(robot):
     checker = checker_with_ball(robot, -0.02)
-    result = plan_widest(checker, START, GOAL)
+    result = plan(checker, START, GOAL, margins=LADDER)
     assert result.status == "invalid_start"
     assert result.message == plan(checker, START, GOAL).message
 
@@ -71,7 +72,7 @@ def test_an_extra_margin_adds_to_the_checkers_own(robot):
 @pytest.mark.parametrize("extra", [(), (0.0, 0.01), (0.01, 0.01), (-0.01,), (float("nan"),)])
 def test_margins_that_do_not_decrease_are_refused(robot, extra):
     with pytest.raises(PlanningError, match="decreasing"):
-        plan_widest(checker_with_ball(robot, 0.03), START, GOAL, extra=extra)
+        plan(checker_with_ball(robot, 0.03), START, GOAL, margins=extra)
 
 
 def test_a_checker_without_margins_is_refused():
@@ -79,4 +80,4 @@ def test_a_checker_without_margins_is_refused():
     point = disk_world.PointRobot(np.full(2, -1.0), np.full(2, 1.0), free)
     checker = disk_world.DiskChecker(np.array([[0.0, 0.9]]), np.array([0.05]), point)
     with pytest.raises(PlanningError, match="with_extra_margin"):
-        plan_widest(checker, [0.0, 0.0], [0.5, 0.5])
+        plan(checker, [0.0, 0.0], [0.5, 0.5], margins=LADDER)

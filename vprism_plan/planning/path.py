@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What becomes of a path that was found: shortened, made cheaper, resampled, verified.
+
+OMPL's `PathSimplifier` cuts accepted edges at points of its choice and keeps the
+pieces unchecked. A checker that samples at its finest step may refuse such a piece by
+microns, and the final verification then refuses the path. Here an edge enters the path
+only as it will be verified: same ends, same direction.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from vprism_plan.planning.objectives import PathCost
+from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, Waypoints
+from vprism_plan.planning.result import PlanReport, PlanResult
+
+Check = Callable[[np.ndarray, np.ndarray], bool]
+
+_log = logging.getLogger(__name__)
+
+_ROUNDING = 1e-9  # radians or metres beyond a joint limit that count as on it
+_MOST_CUTS, _FUTILE_CUTS = 120, 25
+_SNAP = 0.02  # share of the path: ends of a cut this near to a waypoint are moved onto it
+_WORTHWHILE = 1e-6
+_FUTILE_MOVES = 400
+_MOVE_RANGE = (0.003, 0.6)  # Euclidean in joint space
+
+
+class MotionCheck:
+    """Counts and answers `checker.check_motion` for edges that may become part of a path.
+
+    An edge that turns a continuous joint by half a turn or more is refused: it means what it
+    says, but others who follow the path could take it for the shorter way round. So is one
+    that leaves the joint limits, which not every checker knows.
+    """
+
+    def __init__(self, checker: CheckerLike) -> None:
+        self._check = checker.check_motion
+        self._robot = checker.robot
+        self._turns = np.asarray(checker.robot.continuous, dtype=bool)
+        self.count = 0
+
+    def __call__(self, qa: Configuration, qb: Configuration) -> bool:
+        """Return whether the straight motion may become part of a path."""
+        self.count += 1
+        if np.any(np.abs(qb - qa)[self._turns] >= np.pi):
+            return False
+        if outside_limits(self._robot, np.stack([qa, qb])).any():
+            return False
+        return bool(self._check(qa, qb))
+
+
+def outside_limits(robot: Any, path: Waypoints) -> Bool[np.ndarray, " t"]:
+    """Return which rows have a limited joint outside its limits by more than rounding."""
+    low = path < np.asarray(robot.lower) - _ROUNDING
+    high = path > np.asarray(robot.upper) + _ROUNDING
+    return np.asarray(np.any((low | high) & ~np.asarray(robot.continuous, dtype=bool), axis=1))
+
+
+def shorten(
+    path: Waypoints,
+    check: Check,
+    seed: int,
+    deadline: float,
+    now: Now = time.perf_counter,
+    cost: PathCost | None = None,
+) -> Waypoints:
+    """Shorten a path by dropping waypoints and by random cuts (Geraerts and Overmars 2007).
+
+    Both ends stay, and edges that were not in `path` passed `check`. The result depends on the
+    clock only if the deadline strikes. With `cost`, only what does not raise it is taken.
+    """
+    rng = np.random.default_rng(seed)
+    path = drop_waypoints(path, check, deadline, now, cost)
+    futile = 0
+    for _ in range(_MOST_CUTS):
+        if len(path) < 3 or futile >= _FUTILE_CUTS or now() > deadline:
+            break
+        cut = _cut(path, check, rng, cost)
+        futile = futile + 1 if cut is None else 0
+        path = path if cut is None else cut
+    return drop_waypoints(path, check, deadline, now, cost)
+
+
+def drop_waypoints(
+    path: Waypoints,
+    check: Check,
+    deadline: float,
+    now: Now = time.perf_counter,
+    cost: PathCost | None = None,
+) -> Waypoints:
+    """Connect each kept waypoint to the furthest one it reaches in a straight line."""
+    kept = [0]
+    last = len(path) - 1
+    while kept[-1] < last:
+        here = kept[-1]
+        reached = here + 1
+        for ahead in range(last, here + 1, -1):
+            if now() > deadline:
+                break
+            straight = path[[here, ahead]]
+            if _no_dearer(cost, path[here : ahead + 1], straight) and check(*straight):
+                reached = ahead
+                break
+        kept.append(reached)
+    return path[kept]
+
+
+def _no_dearer(cost: PathCost | None, old: Waypoints, new: Waypoints) -> bool:
+    """Whether a stretch of a path may be replaced by another as far as the cost goes."""
+    return cost is None or cost.path(new) <= cost.path(old)
+
+
+def _cut(
+    path: Waypoints, check: Check, rng: np.random.Generator, cost: PathCost | None
+) -> Waypoints | None:
+    """Try to replace the path between two random points of it by a straight motion."""
+    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    first, second = np.sort(rng.uniform(0.0, along[-1], 2))
+    i, a, first = _point(path, along, float(first))
+    j, b, second = _point(path, along, float(second))
+    if i == j:
+        return None
+    start = path[i] if a is None else a
+    end = path[j] if b is None else b
+    gain = second - first - float(np.linalg.norm(end - start))
+    if gain < _WORTHWHILE * along[-1]:
+        return None
+    rest = path[j:] if b is None else path[j + 1 :]
+    middle = [q[None] for q in (a, b) if q is not None]
+    shorter = np.concatenate([path[: i + 1], *middle, rest])
+    # Edges outside the cut are the same; compared as a whole, splitting one counts, too.
+    if not _no_dearer(cost, path, shorter) or not check(start, end):
+        return None
+    # Splitting an accepted edge makes new edges: they have to pass by themselves.
+    if a is not None and not check(path[i], a):
+        return None
+    if b is not None and not check(b, path[j + 1]):
+        return None
+    return shorter
+
+
+def _point(
+    path: Waypoints, along: Float[np.ndarray, " t"], s: float
+) -> tuple[int, Configuration | None, float]:
+    """Return the edge that holds arc length s, the point there, and s.
+
+    Near a waypoint: its index, None, and its arc length.
+    """
+    nearest = int(np.argmin(np.abs(along - s)))
+    if abs(along[nearest] - s) <= _SNAP * along[-1]:
+        return nearest, None, float(along[nearest])
+    edge = int(np.searchsorted(along, s, side="right")) - 1
+    share = (s - along[edge]) / (along[edge + 1] - along[edge])
+    return edge, path[edge] + share * (path[edge + 1] - path[edge]), s
+
+
+def cheapen(
+    path: Waypoints, check: Check, seed: int, deadline: float, now: Now, cost: PathCost
+) -> Waypoints:
+    """Lower a path's cost by moving its waypoints at random, one at a time.
+
+    Where an edge costs much it gets a waypoint more, so that it can bend. Every change is
+    taken only if the path costs less with it and its new edges pass the check.
+    """
+    rng = np.random.default_rng([seed, 0xC4EA])
+    total = cost.path(path)
+    futile = 0
+    while futile < _FUTILE_MOVES and now() <= deadline:
+        moved = _moved(path, rng, cost)
+        new = cost.path(moved)
+        futile += 1
+        if not new < total * (1.0 - 1e-9):
+            continue
+        known = {(a.tobytes(), b.tobytes()) for a, b in pairwise(path)}
+        if all(check(a, b) for a, b in pairwise(moved) if (a.tobytes(), b.tobytes()) not in known):
+            # What brings next to nothing must not keep the search alive.
+            futile = 0 if new < total * (1.0 - 1e-3) else futile
+            path, total = moved, new
+    return path
+
+
+def _moved(path: Waypoints, rng: np.random.Generator, cost: PathCost) -> Waypoints:
+    """Return the path with a waypoint moved, one that was there or a new one."""
+    costs = np.array([cost.edge(a, b) for a, b in pairwise(path)])
+    share = 0.5 / len(costs) + 0.5 * costs / max(float(costs.sum()), 1e-300)
+    edge = int(rng.choice(len(costs), p=share / share.sum()))
+    spread = np.exp(rng.uniform(*np.log(_MOVE_RANGE)))
+    step = rng.normal(size=path.shape[1]) * spread / np.sqrt(path.shape[1])
+    place = edge + int(rng.integers(3))  # its beginning, its end, or a point between
+    if place == edge + 2 or not 0 < place < len(path) - 1:
+        between = path[edge] + rng.uniform(0.1, 0.9) * (path[edge + 1] - path[edge])
+        return np.concatenate([path[: edge + 1], (between + step)[None], path[edge + 1 :]])
+    moved = path.copy()
+    moved[place] += step
+    return moved
+
+
+def resample(path: Waypoints, check: Check, spacing: float) -> Waypoints:
+    """Insert equally spaced waypoints on edges longer than `spacing`.
+
+    An edge, accepted within a tolerance, whose pieces do not all pass by themselves stays whole.
+    """
+    rows = [path[0]]
+    for edge in pairwise(path):
+        pieces = interpolated(np.stack(edge), spacing)
+        split = all(check(a, b) for a, b in pairwise(pieces))
+        rows += list(pieces[1:]) if split else [edge[1]]
+    return np.stack(rows)
+
+
+def interpolated(path: Waypoints, spacing: float) -> Waypoints:
+    """Return the path with points at most `spacing` apart."""
+    pieces = [path[:1]]
+    for a, b in pairwise(path):
+        n = max(1, math.ceil(float(np.linalg.norm(b - a)) / spacing))
+        inner = a + (b - a) * (np.arange(1, n)[:, None] / n)
+        pieces += [inner, b[None]]
+    return np.concatenate(pieces)
+
+
+def verified(
+    checker: CheckerLike,
+    path: Waypoints,
+    clearance_step: float,
+    report: PlanReport,
+    now: Now = time.perf_counter,
+) -> PlanResult:
+    """Check every edge of the final waypoints again, and measure the path."""
+    began = now()
+    outside = outside_limits(checker.robot, path)
+    verdicts: list[Any] = []
+    for edge, (a, b) in enumerate(pairwise(path)):
+        verdicts.append(checker.check_motion_report(a, b))
+        beyond = outside[edge : edge + 2].any()
+        refused = beyond or not verdicts[-1].valid
+        if refused:
+            break
+    checks = report.motion_checks + len(verdicts)
+    report = replace(report, verification_time=now() - began, motion_checks=checks)
+    if refused:
+        _log.warning("edge %d of the final path failed its verification", edge)
+        reason = "it leaves the joint limits" if beyond else one_line(verdicts[-1])
+        report = replace(report, goal_index=None)
+        message = (
+            f"edge {edge} of {len(path) - 1} of the final path was refused when checked again: "
+            f"{reason}"
+        )
+        return PlanResult(None, "verification_failed", report, message, path, verdicts[-1])
+    clearances = [checker.clearance(q) for q in interpolated(path, clearance_step)]
+    shares: dict[str, float] = {}
+    for q in path:
+        for kind, share in checker.explain(q).shares.items():
+            shares[kind] = max(shares.get(kind, 0.0), float(share))
+    report = replace(
+        report,
+        path_length=float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+        waypoints=len(path),
+        min_clearance=float(min(clearances)),
+        clearance_samples=len(clearances),
+        certified=all(verdict.certified for verdict in verdicts),
+        tolerance=float(max(verdict.tolerance for verdict in verdicts)),
+        shares=shares,
+    )
+    message = (
+        f"path of {len(path)} waypoints, length {report.path_length:.3g}, smallest clearance "
+        f"{report.min_clearance:.3g} m in {len(clearances)} samples"
+    )
+    return PlanResult(path, "exact", report, message)
+
+
+def one_line(report: Any) -> str:
+    """Return a report's text without line breaks."""
+    return " ".join(report.text().split())

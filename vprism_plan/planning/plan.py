@@ -1,0 +1,288 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""`plan`: one query, one honest answer."""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from vprism_plan._numbers import is_number
+from vprism_plan.errors import PlanningError
+from vprism_plan.planning.attempts import Query, attempt, within_risk
+from vprism_plan.planning.goals import (
+    PoseGoalConfig,
+    ReachRegion,
+    configuration,
+    refuse,
+    valid_goals,
+)
+from vprism_plan.planning.objectives import PathCost, RiskObjective
+from vprism_plan.planning.path import one_line
+from vprism_plan.planning.planners import planner_kind, planners
+from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, SecondOpinion
+from vprism_plan.planning.result import PlanReport, PlanResult
+from vprism_plan.planning.search import SearchRequest, clock_named
+
+_log = logging.getLogger(__name__)
+
+
+def plan(
+    checker: CheckerLike,
+    start: ArrayLike | Sequence[float],
+    goal: ArrayLike | Sequence[float] | ReachRegion,
+    planner: str = "RRTConnect",
+    time_limit: float | int = 5.0,
+    seed: int = 0,
+    *,
+    stop: str = "limit",
+    convergence: tuple[float, int] = (0.01, 1000),
+    simplify: bool = True,
+    simplify_time: float = 2.0,
+    step: float | None = None,
+    interpolate: float | None = None,
+    clearance_step: float = 0.05,
+    pose_goal: PoseGoalConfig | None = None,
+    second_opinion: SecondOpinion | None = None,
+    clock: str = "wall",
+    objective: str | RiskObjective = "length",
+    warm_start: bool = True,
+    margins: Sequence[float] | None = None,
+) -> PlanResult:
+    """Plan a motion from `start` to `goal` and verify it.
+
+    Start and goal are checked first. The path found is shortened, optionally resampled,
+    and then every edge of the returned array is checked again with
+    `checker.check_motion_report`. If the checker bounds the probability of collision
+    (`max_risk`), the whole path is then judged at once, by worlds the search has not seen;
+    a path that is too risky as a whole is searched for again under a tighter bound on its
+    edges, as long as the time limit allows. Exceptions raised by the checker propagate.
+
+    Args:
+        checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
+        start: start configuration (dof,), radians or metres.
+        goal: goal configuration (dof,); or several, (g, dof), of which any will do; or the
+            pose (4, 4) of the end effector in the world frame (for a robot of four joints: if
+            its last row is 0 0 0 1); or a `ReachRegion`. `report.refused_goals` says which
+            were refused and why.
+        planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
+            BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
+        time_limit: time for the search in seconds, more than 0; on `clock`. Preparing an
+            objective (worlds drawn, the first time) counts; where it alone takes as long, the
+            status is "timeout".
+        seed: an integer from 0. The same seed gives the same path as long as the search
+            ends by itself before the limit. OMPL's generator is global: this seeds it.
+        stop: when the optimising planners (RRTstar, InformedRRTstar, SORRTstar, BITstar,
+            AORRTC, PRMstar) stop: "limit", at the time limit (their path then depends on the
+            machine's speed); "first", at the first solution; "converged", when the cost
+            has settled. The others stop at their first solution in any case.
+        convergence: for stop="converged": (tolerance, patience), stop when `patience`
+            iterations have lowered the cost by less than the fraction `tolerance`.
+        simplify: whether to shorten the path after the search.
+        simplify_time: seconds after which no further round of shortening starts.
+        step: length of the planner's steps in the metric of the space; OMPL's choice
+            (a fifth of the space's extent) if None.
+        interpolate: largest distance between waypoints of the result, Euclidean in
+            joint space; no waypoints are added if None. An edge whose pieces do not all
+            pass the check by themselves stays whole.
+        clearance_step: distance between the samples of the reported clearance.
+        pose_goal: how a pose, or a region, is turned into configurations.
+        second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
+            the path is still handed out: the report and the message say so.
+        clock: what limits, and all times of the report, are measured by: "wall", or
+            "process", the processor time of this process, comparable on a busy machine (a
+            search that waits, as for a slow checker, ends after fifty times the limit).
+        objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
+            objective are accepted; shortening then never raises the cost, and afterwards
+            waypoints are moved, within `simplify_time`, where that lowers it. A straight
+            motion to the goal is taken at once only if it runs no risk.
+        warm_start: with a risk, whether RRTstar, InformedRRTstar and SORRTstar are given the
+            path of a quick RRTConnect to begin with, out of the time limit, and draw half of
+            their samples around the best path so far.
+        margins: metres beyond the checker's own margin, decreasing, such as (0.02, 0.01,
+            0.005, 0.0): with room to spare the path keeps away, in a narrow place it goes
+            through. The widest comes first, each with an equal share of the time that is left;
+            the first path is returned, and its `message` names the margin, or else the last
+            answer. Without 0 at the end, problems that only the checker's own margin allows
+            stay unsolved. The checker needs `with_extra_margin`.
+
+    Returns:
+        A `PlanResult`; `result.solved` is True only for a verified path to the goal.
+
+    Raises:
+        PlanningError: for a malformed query, naming the value and the valid ones.
+    """
+    request = SearchRequest(planner, time_limit, seed, stop, convergence, step, clock)
+    for name, value in (("interpolate", interpolate), ("clearance_step", clearance_step)):
+        if value is not None and not (is_number(value) and value > 0.0):
+            raise PlanningError(f"{name} is {value!r}; it must be more than 0")
+    if not (is_number(simplify_time) and simplify_time >= 0.0):
+        raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
+    _refuse_unfit(second_opinion, checker)
+    q_start = configuration(start, checker.robot, "start")
+    now = clock_named(clock)
+
+    def answer(judge: CheckerLike, limit: float) -> PlanResult:
+        asked = replace(request, time_limit=limit)
+        found = _prepared(judge, q_start, goal, pose_goal, asked, objective, now)
+        if not isinstance(found, PlanResult):
+            goals, cost, report = found
+            query = Query(
+                q_start, goals, asked, cost, warm_start and stop != "first", simplify,
+                float(simplify_time), interpolate, clearance_step, now,
+            )  # fmt: skip
+            found = within_risk(
+                judge,
+                lambda strict, left, number: attempt(strict, query, report, left, number),
+                asked.time_limit - report.objective_time,
+                now,
+            )
+            if found.path is not None:
+                paid = found.report.path_length if cost is None else cost.path(found.path)
+                found = replace(found, report=replace(found.report, cost=paid))
+        found = replace(found, warnings=tuple(getattr(judge, "warnings", ())))
+        return _reviewed(_with_allowed_contacts(found, judge), judge, second_opinion, now)
+
+    if margins is None:
+        return answer(checker, request.time_limit)
+    return _widest(checker, margins, answer, request.time_limit, now)
+
+
+def _widest(
+    checker: Any,
+    margins: Sequence[float],
+    answer: Callable[[CheckerLike, float], PlanResult],
+    time_limit: float,
+    now: Now,
+) -> PlanResult:
+    """Return the answer with the widest margin that has a path, else the last answer."""
+    steps = np.asarray(margins, dtype=np.float64)
+    good = steps.ndim == 1 and len(steps) > 0 and np.isfinite(steps).all()
+    if not (good and (steps >= 0.0).all() and (np.diff(steps) < 0.0).all()):
+        raise PlanningError(
+            f"margins is {margins!r}; it must hold decreasing margins of at least 0 m, such as "
+            "(0.02, 0.01, 0.005, 0.0)"
+        )
+    if not hasattr(checker, "with_extra_margin"):
+        raise PlanningError(
+            f"a {type(checker).__name__} has no with_extra_margin; give a CollisionChecker"
+        )
+    left = time_limit
+    for number, step in enumerate(steps.tolist()):
+        judge = checker.with_extra_margin(step) if step > 0.0 else checker
+        share = left / (len(steps) - number) if left > 0.0 else time_limit / len(steps)
+        began = now()
+        result = answer(judge, share)
+        left -= now() - began
+        if result.solved:
+            kept = f"{1000.0 * step:g} mm beyond the checker's margin"
+            return replace(result, message=f"{result.message}; kept {kept}")
+    return result
+
+
+def _prepared(
+    checker: CheckerLike,
+    start: Configuration,
+    goal: Any,
+    pose_goal: PoseGoalConfig | None,
+    request: SearchRequest,
+    objective: str | RiskObjective,
+    now: Now,
+) -> tuple[np.ndarray, PathCost | None, PlanReport] | PlanResult:
+    """Return the goals, what paths cost (None for length) and the report, or a refusal."""
+    report = PlanReport(request.planner, request.seed, request.time_limit, clock=request.clock)
+    refusal = refuse(checker, start, "start", report)
+    if refusal is not None:
+        return refusal
+    ends = valid_goals(checker, goal, start, pose_goal or PoseGoalConfig(), report)
+    if isinstance(ends, PlanResult):
+        return ends
+    goals, report = ends
+    kind = planner_kind(request.planner)
+    # A second thread asks whether further goals are valid. The checker is Python, whose lock
+    # the first thread holds.
+    if kind.starts_thread and len(goals) > 1:
+        raise PlanningError(
+            f"{request.planner} deadlocks with more than one goal configuration, here "
+            f"{len(goals)}; give one, or use RRTConnect, or another of `planners()` that starts "
+            "no thread"
+        )
+    asked = 1 + len(goals) + len(report.refused_goals)
+    report = replace(report, state_checks=asked, motion_checks=len(goals))
+    if objective == "length":
+        return goals, None, report
+    if not isinstance(objective, RiskObjective):
+        raise PlanningError(
+            f"objective is {objective!r}; it must be 'length' or a RiskObjective, for example "
+            "RiskObjective(kind='joint')"
+        )
+    if not kind.honours_objective:
+        able = ", ".join(name for name, k in planners().items() if k.honours_objective)
+        raise PlanningError(
+            f"{request.planner} does not honour an objective{': it ' if kind.note else ''}"
+            f"{kind.note}; planners that do are {able}"
+        )
+    began, cost = now(), None
+    for step in objective.preparation(checker):
+        step()
+        if now() - began >= request.time_limit:
+            break
+    else:
+        cost = objective.cost(checker)
+    took = now() - began
+    report = replace(report, objective=objective.name, objective_time=took)
+    if request.time_limit - took > 0.0:
+        return goals, cost, report
+    message = (
+        f"preparing the objective '{objective.name}' took {took:.2f} s of the "
+        f"{request.time_limit:g} s allowed; what was prepared is kept: allow more time, plan "
+        "again, or prepare it ahead by objective.cost(checker)"
+    )
+    return PlanResult(None, "timeout", report, message)
+
+
+def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
+    """Raise PlanningError before any search if the judge cannot be asked about its paths."""
+    if judge is None:
+        return
+    if not isinstance(judge, SecondOpinion):
+        raise PlanningError(
+            f"second_opinion is a {type(judge).__name__} without 'robot' and 'review'; give a "
+            "MeshChecker, or None"
+        )
+    ours, theirs = tuple(checker.robot.joint_names), tuple(judge.robot.joint_names)
+    if ours != theirs:
+        raise PlanningError(
+            f"second_opinion is about a robot with joints {theirs}; the checker's are {ours}"
+        )
+
+
+def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResult:
+    """Say in the report, and the message, what the robot ends touching because it may."""
+    if result.path is None:
+        return result
+    touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
+    if not touching:
+        return result
+    named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
+    message = f"{result.message}; ends touching, as allowed: {named}"
+    report = replace(result.report, allowed_contacts=touching)
+    return replace(result, report=report, message=message)
+
+
+def _reviewed(
+    result: PlanResult, checker: CheckerLike, judge: SecondOpinion | None, now: Now
+) -> PlanResult:
+    """Say in the report what another judge makes of the path; it is not obeyed."""
+    if judge is None or result.path is None:
+        return result
+    began = now()
+    opinion = judge.review(checker, result.path)
+    report = replace(result.report, second_opinion=opinion, second_opinion_time=now() - began)
+    if opinion.valid:
+        return replace(result, report=report)
+    says = one_line(opinion)
+    _log.warning("second opinion on the verified path: %s", says)
+    return replace(result, report=report, message=f"{result.message}; but {says}")

@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""One search with OMPL: numpy in, numpy out.
+
+Every OMPL object lives and dies inside `search`; nothing of it outlives the call, so
+nothing can leak and no planner is ever used twice. What is global to the process, the log
+and the seed of the generators, is set here as well.
+"""
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from ompl import base as ob
+from ompl import util as ou
+
+from vprism_plan._numbers import is_number, is_whole
+from vprism_plan.errors import PlanningError
+from vprism_plan.planning.objectives import PathCost, make_objective
+from vprism_plan.planning.ompl_adapter import (
+    StateReader,
+    VPrismMotionValidator,
+    VPrismStateValidityChecker,
+    nearest_turns,
+    state_space,
+    to_state,
+)
+from vprism_plan.planning.planners import (
+    GOAL_BIAS,
+    GuidedGoal,
+    PlannerKind,
+    SpaceLengthObjective,
+    make_planner,
+    planner_kind,
+)
+from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, Waypoints
+from vprism_plan.planning.result import Improvement
+
+MAX_SEED = 2**32 - 2
+# Times the limit after which a search by processor time ends by the wall clock: OMPL sleeps
+# while it waits for goals, which spends none. A machine that busy would be no help anyway.
+PATIENCE = 50.0
+# Processor time is that of the whole process, worker threads included.
+_CLOCKS: dict[str, Now] = {"wall": time.perf_counter, "process": time.process_time}
+_GOAL_TOLERANCE = 1e-9
+_NOTICEABLE = 0.02  # relative fall of the cost that is worth a look at the path
+
+
+@dataclass(frozen=True)
+class SearchRequest:
+    """How to search: the arguments of `plan`, checked (PlanningError names the first bad one)."""
+
+    planner: str
+    time_limit: float | int
+    seed: int
+    stop: str
+    convergence: tuple[float, int]
+    step: float | None
+    clock: str
+
+    def __post_init__(self) -> None:
+        kind = planner_kind(self.planner)
+        clock_named(self.clock)
+        if kind.starts_thread and self.clock != "wall":
+            raise PlanningError(
+                f"clock is {self.clock!r} with {self.planner}: its second thread would wait for "
+                "ever for a termination condition that is Python; use clock='wall'"
+            )
+        if self.stop == "converged" and kind.optimising and not kind.reports_cost:
+            raise PlanningError(
+                f"{self.planner} does not say what its path costs; use stop='limit'"
+            )
+        limit, step = self.time_limit, self.step
+        if not (is_number(limit) and math.isfinite(limit) and limit > 0):
+            raise PlanningError(f"time_limit is {limit!r} s; it must be finite and more than 0")
+        if self.stop not in ("limit", "first", "converged"):
+            raise PlanningError(
+                f"stop is {self.stop!r}; valid values are 'limit', 'first', 'converged'"
+            )
+        tolerance, patience = self.convergence
+        if not (0.0 < tolerance < 1.0 and patience >= 1):
+            raise PlanningError(
+                f"convergence is {self.convergence!r}; it must be (tolerance in (0, 1), patience "
+                "of at least 1 iteration)"
+            )
+        if step is not None and not (is_number(step) and math.isfinite(step) and step > 0.0):
+            raise PlanningError(f"step is {step!r}; it must be finite and more than 0, or None")
+        set_ = object.__setattr__
+        set_(self, "time_limit", float(limit))
+        set_(self, "seed", checked_seed(self.seed))
+        set_(self, "convergence", (float(tolerance), int(patience)))
+        set_(self, "step", None if step is None else float(step))
+
+
+@dataclass(frozen=True)
+class SearchOutcome:
+    """What a search found; `path` (T, dof) begins at the start as given and is not yet verified."""
+
+    status: Literal["exact", "approximate", "timeout"]
+    path: np.ndarray | None
+    goal_index: int | None
+    planning_time: float
+    state_checks: int
+    motion_checks: int
+    history: tuple[Improvement, ...] = ()
+
+
+def search(
+    checker: CheckerLike,
+    start: Configuration,
+    goals: Float[np.ndarray, "g dof"],
+    request: SearchRequest,
+    cost: PathCost | None = None,
+    lead: Waypoints | None = None,
+) -> SearchOutcome:
+    """Search for a path from start to any of the goals. Exceptions of the checker propagate.
+
+    `cost` is made small, length if it is None. `lead`, a valid path to one of the goals, is
+    for planners with a goal bias: their first solution.
+    """
+    kind = planner_kind(request.planner)
+    with quiet_ompl():
+        # 0 would mean "from the clock". Only generators made from now on have this seed, so it
+        # comes first; a second time in a process OMPL logs an error that does not hold for them.
+        ou.RNG.setSeed(request.seed + 1)
+        space = state_space(checker.robot)
+        si = ob.SpaceInformation(space)
+        held = _HeldErrors(checker) if kind.starts_thread else None
+        judge: CheckerLike = checker if held is None else held
+        states = VPrismStateValidityChecker(si, judge)
+        motions = VPrismMotionValidator(si, judge)
+        si.setStateValidityChecker(states)
+        si.setMotionValidator(motions)
+        si.setup()
+        problem = ob.ProblemDefinition(si)
+        problem.addStartState(to_state(space, start))
+        planner = make_planner(kind, si, request.step)
+        _set_objective(problem, si, checker, request, cost)
+        guided: GuidedGoal | None = None
+        goal = ob.GoalState(si) if len(goals) == 1 else ob.GoalStates(si)
+        for q in goals:
+            (goal.setState if len(goals) == 1 else goal.addState)(to_state(space, q))
+        problem.setGoal(goal)
+        if lead is not None:
+            planner.setProblemDefinition(problem)
+            planner.setup()  # settles the planner's steps
+            guided = GuidedGoal(si, goals, request.seed, planner.getRange())
+            guided.lead(lead)
+            problem.setGoal(guided)
+            planner.setGoalBias(GOAL_BIAS)
+        planner.setProblemDefinition(problem)
+        planner.setup()
+
+        reader = StateReader(space, len(start))
+        now = clock_named(request.clock)
+        began = now()
+        if held is None:
+            status, history = _solve(planner, problem, reader, start, request, guided)
+        else:
+            status, history = held.solve(planner, time_is_up(request.clock, request.time_limit)), ()
+        planned = now()
+
+        verdict: Literal["exact", "approximate", "timeout"] = "timeout"
+        path, goal_index = None, None
+        if problem.hasSolution():
+            solution = problem.getSolutionPath()
+            goal_index = _reached(reader, solution, goals)
+            claimed = status == ob.PlannerStatus.EXACT_SOLUTION and problem.hasExactSolution()
+            # OMPL calls approximate solutions "solved"; the last state decides.
+            verdict = "exact" if claimed and goal_index is not None else "approximate"
+            path = _waypoints(reader, solution, start)
+        took, asked = planned - began, (states.checks, motions.checks)
+        return SearchOutcome(verdict, path, goal_index, took, *asked, history)
+
+
+def _set_objective(
+    problem: Any, si: Any, checker: CheckerLike, request: SearchRequest, cost: PathCost | None
+) -> None:
+    kind = planner_kind(request.planner)
+    if cost is not None and kind.honours_objective:
+        objective = make_objective(si, checker, cost)
+    elif kind.starts_thread:
+        objective = ob.PathLengthOptimizationObjective(si)  # the only one that is no Python
+    elif kind.optimising or kind.honours_objective:
+        compound = si.getStateSpace().isCompound()
+        length = SpaceLengthObjective if compound else ob.PathLengthOptimizationObjective
+        objective = length(si)
+    else:
+        return
+    if request.stop == "first" and kind.obeys_threshold:
+        # Any finite cost satisfies the objective.
+        objective.setCostThreshold(objective.infiniteCost())
+    problem.setOptimizationObjective(objective)
+
+
+def _solve(
+    planner: Any,
+    problem: Any,
+    reader: StateReader,
+    start: Configuration,
+    request: SearchRequest,
+    guided: GuidedGoal | None,
+) -> tuple[Any, tuple[Improvement, ...]]:
+    """Run the planner until it is done or has to stop; note every better path on the way."""
+    kind = planner_kind(request.planner)
+    now = clock_named(request.clock)
+    began = now()
+    end = began + request.time_limit
+    if not (kind.optimising and kind.reports_cost):
+        return planner.solve(time_is_up(request.clock, request.time_limit)), ()
+    progress = _Progress(planner, request, kind)
+    history: list[Improvement] = []
+    idle = 0
+    try:
+        while True:
+            # A condition that has held once holds for ever: each round has its own.
+            timed = time_is_up(request.clock, max(end - now(), 0.0))
+            either = ob.PlannerTerminationCondition(progress)
+            status = planner.solve(ob.plannerOrTerminationCondition(timed, either))
+            if not (kind.resumes and problem.hasExactSolution()):
+                break
+            value = planner.bestCost().value()
+            better = not history or value < history[-1].cost
+            idle = 0 if better else idle + 1
+            if better:
+                path = _waypoints(reader, problem.getSolutionPath(), start)
+                history.append(Improvement(now() - began, value, path))
+                if guided is not None:
+                    guided.path = path
+            # A planner that returns again and again has a cost of 0: nothing is left to improve.
+            if progress.settled or idle > 1 or now() >= end or request.stop == "first":
+                break
+        return status, tuple(history)
+    finally:
+        del progress.best_cost  # AORRTC keeps its termination condition: a cycle
+
+
+class _Progress:
+    """A termination condition: the best cost has become noticeably better, or has settled.
+
+    Between two calls of `solve` the best path can be read; while it runs, it cannot. Calls
+    (one per iteration) and costs decide, not clocks: the same seed stops at the same ones.
+
+    Attributes:
+        settled: whether `patience` calls brought less than the relative `tolerance`, where
+            the request asks for that; a patience of 0 settles at the first solution.
+    """
+
+    def __init__(self, planner: Any, request: SearchRequest, kind: PlannerKind) -> None:
+        self.settled = False
+        self.best_cost = planner.bestCost
+        # Of a planner that cannot resume only the first solution counts.
+        self._least = _NOTICEABLE if kind.resumes else 2.0
+        self._noted = self._reference = math.inf
+        self._tolerance, self._patience = request.convergence
+        self._settles = request.stop == "converged"
+        if request.stop == "first" and not kind.obeys_threshold:
+            self._settles, self._patience = True, 0
+        self._calls = self._reference_call = 0
+
+    def __call__(self) -> bool:
+        cost = self.best_cost().value()
+        first = cost < self._noted == math.inf
+        if first or cost < self._noted * (1.0 - self._least):
+            self._noted = cost
+            return True
+        if not self._settles:
+            return False
+        self._calls += 1
+        if cost < self._reference * (1.0 - self._tolerance):
+            self._reference, self._reference_call = cost, self._calls
+        found = self._reference < math.inf
+        self.settled = found and self._calls - self._reference_call >= self._patience
+        return self.settled
+
+
+def _reached(reader: StateReader, solution: Any, goals: Float[np.ndarray, "g dof"]) -> int | None:
+    last = reader.read(solution.getState(solution.getStateCount() - 1))
+    worst = np.max(np.abs(nearest_turns(goals, last, reader.wraps) - last), axis=1)
+    best = int(np.argmin(worst))
+    return best if worst[best] <= _GOAL_TOLERANCE else None
+
+
+def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoints:
+    """Copy a path to numpy, wrapping coordinates continued from row to row, from the start's
+    own turns on."""
+    rows = [start]
+    for state in path.getStates()[1:]:
+        rows.append(nearest_turns(reader.read(state).copy(), rows[-1], reader.wraps))
+    return np.stack(rows)
+
+
+class _HeldErrors:
+    """A checker whose first exception waits until the search is over.
+
+    PRM and PRMstar run a second C++ thread. An exception that leaves `solve` destroys it
+    unjoined, and the process ends with `std::terminate`. So the first one is held back, later
+    questions are answered "invalid", the search is told to stop, and `solve` raises it again.
+    """
+
+    def __init__(self, checker: CheckerLike) -> None:
+        self.robot, self.clearance, self.explain = checker.robot, checker.clearance, checker.explain
+        self.is_valid, self.check_motion = checker.is_valid, checker.check_motion
+        self.check_motion_report = checker.check_motion_report
+        self._checker = checker
+        self._stop: Callable[[], None] | None = None
+        self._error: BaseException | None = None
+
+    def is_valid_buffer(self, q: Any) -> bool:
+        return self._ask(self._checker.is_valid_buffer, q)
+
+    def check_motion_buffer(self, qa: Any, qb: Any) -> bool:
+        return self._ask(self._checker.check_motion_buffer, qa, qb)
+
+    def _ask(self, question: Callable[..., bool], *configurations: Any) -> bool:
+        if self._error is not None:
+            return False
+        try:
+            return question(*configurations)
+        except BaseException as error:  # KeyboardInterrupt would end the process, too
+            self._error = error
+            if self._stop is not None:
+                self._stop()
+            return False
+
+    def solve(self, planner: Any, timed: Any) -> Any:
+        """Run a planner and return its status, or raise what was held back."""
+        self._stop = timed.terminate
+        status = planner.solve(timed)
+        self._stop = None
+        error, self._error = self._error, None
+        try:
+            if error is not None:
+                raise error
+        finally:
+            del error  # its traceback holds this frame: a cycle that would keep the search alive
+        return status
+
+
+def clock_named(name: str) -> Now:
+    """Return the function that reads a clock, seconds; raise PlanningError for an unknown name."""
+    if name not in _CLOCKS:
+        raise PlanningError(
+            f"clock is {name!r}; valid values are 'wall' (time that passes) and 'process' "
+            "(processor time of this process, which other load does not inflate)"
+        )
+    return _CLOCKS[name]
+
+
+def time_is_up(name: str, seconds: float) -> Any:
+    """Return an OMPL termination condition that holds `seconds` from now on a clock.
+
+    With processor time it also holds after `PATIENCE` times as much time has passed.
+    """
+    if name == "wall":
+        # The form without an interval reads the clock itself: no extra thread, no overshoot.
+        return ob.timedPlannerTerminationCondition(seconds)
+    now = clock_named(name)
+    end = now() + seconds
+    asleep = time.perf_counter() + PATIENCE * seconds
+    return ob.PlannerTerminationCondition(lambda: now() >= end or time.perf_counter() >= asleep)
+
+
+_lock = threading.Lock()
+_quiet_depth = 0
+_saved_level: Any = None
+
+
+@contextmanager
+def quiet_ompl() -> Iterator[None]:
+    """Silence OMPL's console log inside the block and restore its level afterwards.
+
+    The level is global to the process. Blocks may nest or overlap between threads:
+    the first one in saves the level, the last one out restores it.
+    """
+    global _quiet_depth, _saved_level  # noqa: PLW0603 - OMPL's level is global itself
+    with _lock:
+        if _quiet_depth == 0:
+            _saved_level = ou.getLogLevel()
+            ou.setLogLevel(ou.LogLevel.LOG_NONE)
+        _quiet_depth += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _quiet_depth -= 1
+            if _quiet_depth == 0:
+                ou.setLogLevel(_saved_level)
+
+
+def checked_seed(seed: Any) -> int:
+    """Return the seed as an int; raise PlanningError unless it is an integer from 0."""
+    if not is_whole(seed) or not 0 <= seed <= MAX_SEED:
+        raise PlanningError(f"seed is {seed!r}; it must be an integer from 0 to {MAX_SEED}")
+    return int(seed)
