@@ -24,7 +24,7 @@ from vprism_plan.planning.goals import (
     solve_region,
 )
 from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 
 def search_request(

@@ -19,7 +19,7 @@ from ompl import base as ob
 
 from vprism_plan.planning._protocol import CheckerLike
 from vprism_plan.planning._spaces import StateReader
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 _TURN = 2.0 * math.pi
 

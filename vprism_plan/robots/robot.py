@@ -18,25 +18,26 @@ from numpy.typing import ArrayLike
 
 from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import _attached, _frames, _inner_balls, _padding
-from vprism_plan.robots._arrays import KinematicArrays
-from vprism_plan.robots._build import Request, robot_fields
-from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._inner_balls import SolidBalls
-from vprism_plan.robots._matrix import (
-    RIGID,
-    SAMPLES,
-    shares_touching,
-    srdf_text,
-    write_srdf_text,
+from vprism_plan.robots import changes, pairs, solid_balls
+from vprism_plan.robots.changes import Held
+from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
+from vprism_plan.robots.kinematics import (
+    Attachment,
+    KinematicArrays,
+    TorchKinematics,
+    build_arrays,
+    frame_poses,
+    joint_values,
+    reach_bound,
+    rigid_pose,
 )
-from vprism_plan.robots._mesh_files import MeshFile, PackageDirs
-from vprism_plan.robots._setup import rigid_pose
-from vprism_plan.robots._sphere_files import write_spheres
-from vprism_plan.robots._sphere_fit import SphereFit
-from vprism_plan.robots._torch_kinematics import TorchKinematics
-from vprism_plan.robots._values import joint_values
 from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
+from vprism_plan.robots.solid_balls import SolidBalls
+from vprism_plan.robots.sphere_files import write_spheres
+from vprism_plan.robots.sphere_fit import SphereFit
+from vprism_plan.robots.spheres import link_spheres
+from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, lock_values, write_srdf
+from vprism_plan.robots.urdf import load_model
 
 if TYPE_CHECKING:
     import torch
@@ -95,7 +96,7 @@ class Robot:
     groups: dict[str, tuple[str, ...]]
     disabled_pairs: dict[frozenset[str], str]
     arrays: KinematicArrays
-    _links: dict[str, _frames.Attachment] = field(repr=False)
+    _links: dict[str, Attachment] = field(repr=False)
     _torch: TorchKinematics = field(repr=False)
     links_with_meshes: tuple[str, ...] = ()
     meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
@@ -110,7 +111,7 @@ class Robot:
     # Link -> metres that the file of its spheres wants it to grow by; in `arrays` already.
     _file_padding: dict[str, float] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
-    held: dict[str, _attached.Held] = field(default_factory=dict, repr=False)
+    held: dict[str, Held] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         make_read_only(self.__dict__)
@@ -132,7 +133,7 @@ class Robot:
         group: str | None = None,
         package_dirs: PackageDirs = None,
         fit: SphereFit | None = None,
-        matrix_samples: int = SAMPLES,
+        matrix_samples: int = pairs.SAMPLES,
     ) -> Robot:
         """Read a robot.
 
@@ -165,22 +166,48 @@ class Robot:
             RobotError: Something above is malformed or does not fit together; the
                 message names it.
         """
-        fields, padding = robot_fields(
-            Request(
-                Path(path),
-                srdf,
-                spheres,
-                base_pose,
-                joints,
-                group,
-                locked or {},
-                package_dirs,
-                fit or SphereFit(),
-                matrix_samples,
-            )
+        path = Path(path)
+        model = load_model(path, package_dirs)
+        beside = path.with_suffix(".srdf")
+        if srdf is None and beside.is_file():
+            srdf = beside
+        semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
+        active = choose_joints(model, semantics, joints, group)
+        fixed_values = lock_values(model, semantics, active, locked or {})
+        base = rigid_pose(np.eye(4) if base_pose is None else base_pose)
+        chosen = link_spheres(model, path, spheres, fit or SphereFit())
+        arrays, links = build_arrays(model, active, fixed_values, chosen.rows, base)
+        stated = None if srdf is None else semantics.disabled
+        tested, disabled, sampled = pairs.choose_pairs(
+            model, arrays, chosen, stated, matrix_samples
         )
-        robot = cls(**fields)
-        return robot.with_padding(padding) if padding else robot
+        arrays = dataclasses.replace(arrays, pairs=tested)
+        solids = {n: link.primitives for n, link in model.links.items() if link.primitives}
+        meshes = {n: link.meshes for n, link in model.links.items() if link.meshes}
+        robot = cls(
+            name=model.name,
+            joint_names=active,
+            locked=fixed_values,
+            velocity_limits=np.array([model.joint_map[j].velocity for j in active]),
+            base_pose=base,
+            link_names=tuple(chosen.rows),
+            geometry=solids,
+            named_states=semantics.full_states(active),
+            groups=semantics.group_links,
+            disabled_pairs=disabled,
+            arrays=arrays,
+            _links=links,
+            _torch=TorchKinematics(arrays),
+            links_with_meshes=tuple(meshes),
+            meshes=meshes,
+            link_spheres=chosen.rows,
+            sphere_sources=chosen.sources,
+            geometry_as_read=solids,
+            meshes_as_read=meshes,
+            _sampled_pairs={p: pairs.hangs_on(model, fixed_values, p) for p in sampled},
+            _file_padding=chosen.padding,
+        )
+        return robot.with_padding(chosen.padding) if chosen.padding else robot
 
     @property
     def dof(self) -> int:
@@ -232,7 +259,7 @@ class Robot:
     @functools.cached_property
     def reach(self) -> float:
         """Upper bound on how far any sphere gets from the root link's origin, metres."""
-        return _frames.reach_bound(self.arrays)
+        return reach_bound(self.arrays)
 
     def links_of(self, name: str) -> tuple[str, ...]:
         """The links with collision spheres that a name stands for.
@@ -300,7 +327,7 @@ class Robot:
         Returns:
             Link name -> (4, 4).
         """
-        R, t = _frames.frame_poses(self.arrays, self.check_configuration(q)[None])
+        R, t = frame_poses(self.arrays, self.check_configuration(q)[None])
         poses = {}
         for link, sits in self._links.items():
             frame = np.eye(4)
@@ -321,7 +348,7 @@ class Robot:
         Raises:
             RobotError: See :meth:`check_configuration`.
         """
-        return _inner_balls.solid_balls(self, q)
+        return solid_balls.solid_balls(self, q)
 
     def random_configuration(self, rng: np.random.Generator) -> Float[np.ndarray, "dof"]:
         """A uniform configuration within the limits."""
@@ -400,7 +427,7 @@ class Robot:
         Raises:
             RobotError: An unknown link or group, or a value that is not allowed for it.
         """
-        return _padding.padded(self, padding, scale)
+        return changes.padded(self, padding, scale)
 
     def attach(
         self,
@@ -434,8 +461,8 @@ class Robot:
         Raises:
             RobotError: The name is taken, a link is unknown, or the shape is unusable.
         """
-        held = _attached.held_object(name, spheres, mesh, max_spheres)
-        return _attached.attached(self, name, link, held, pose, touch_links)
+        held = changes.held_object(name, spheres, mesh, max_spheres)
+        return changes.attached(self, name, link, held, pose, touch_links)
 
     def detach(self, name: str) -> Robot:
         """The same robot without an attached object.
@@ -443,7 +470,7 @@ class Robot:
         Raises:
             RobotError: Nothing of that name is attached, or something is attached to it.
         """
-        return _attached.detached(self, name)
+        return changes.detached(self, name)
 
     def report(self) -> RobotReport:
         """Compare the spheres with the geometry of the URDF, and list what is not tested.
@@ -470,7 +497,7 @@ class Robot:
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
         """
-        shares, _ = shares_touching(self.arrays, self.collision_pairs, samples, seed)
+        shares, _ = pairs.shares_touching(self.arrays, self.collision_pairs, samples, seed)
         names = self.link_names
         return {
             frozenset((names[a], names[b])): float(share)
@@ -498,26 +525,7 @@ class Robot:
         generated "Always" and "Never" pairs that a locked joint moves against each other: an
         SRDF holds for any joints, what was sampled for these values only.
         """
-        states = {
-            name: dict(zip(self.joint_names, map(float, q), strict=True))
-            for name, q in self.named_states.items()
-        }
-        of_urdf = {
-            pair: why
-            for pair, why in self.disabled_pairs.items()
-            if why != RIGID and not pair & set(self.attached)
-        }
-        passing = [p for p in of_urdf if self._sampled_pairs.get(p)]
-        if passing:
-            _logger.warning(
-                "not written to '%s', as they were found for these values of locked joints only "
-                "(%s): %s; to write them, read the robot with all joints in joints=",
-                *(path, self.locked, sorted(map(sorted, passing))),
-            )
-        of_urdf = {pair: why for pair, why in of_urdf.items() if pair not in passing}
-        write_srdf_text(
-            path, srdf_text(self.name, self.joint_names, self.groups, states, self.locked, of_urdf)
-        )
+        write_srdf(path, self)
 
     def _expected(self, opening: str) -> str:
         return f"{opening}{self.dof},) for the joints {list(self.joint_names)}"

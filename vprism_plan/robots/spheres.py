@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._mesh_files import MeshFile
-from vprism_plan.robots._model import RobotModel
-from vprism_plan.robots._sphere_files import LinkSpheres, read_spheres
-from vprism_plan.robots._sphere_fit import SphereFit, fit_spheres
+from vprism_plan.robots.geometry import PrimitiveGeometry
+from vprism_plan.robots.sphere_files import LinkSpheres, read_spheres
+from vprism_plan.robots.sphere_fit import SphereFit, fit_spheres
+from vprism_plan.robots.surfaces import link_triangles
+from vprism_plan.robots.urdf import RobotModel
 
 # Pieces of about this size protrude by about half of it.
 _TILE_EDGE = 0.06
@@ -154,18 +154,6 @@ def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) ->
         if parts:
             rows[name] = np.vstack(parts)
     return ChosenSpheres(rows, sources)
-
-
-def link_triangles(
-    solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
-) -> Float[np.ndarray, "f 3 3"]:
-    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
-
-    Raises:
-        RobotError: A mesh is missing or cannot be used.
-    """
-    parts = [solid.triangles(sides) for solid in solids] + [mesh.triangles() for mesh in meshes]
-    return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
 def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._fit_surface import Surface, split_triangles
-from vprism_plan.robots._geometry import PrimitiveGeometry
+from vprism_plan.robots.geometry import PrimitiveGeometry
+from vprism_plan.robots.surfaces import Surface, split_triangles
 
 # Metres between centres, and by how much balls may fall short of such a point. Together: some
 # thousand balls for an arm, which fall short of its edges by 7 mm at most.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Collision meshes of a URDF: where their files are, and their triangles in metres."""
+"""Collision shapes of links: boxes, cylinders, spheres, and meshes of files."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._mesh_spheres import MOST_BYTES, read_scene, read_triangles
+from vprism_plan.robots.plain_xml import refuse_growing_scene
 
-# No link is longer, metres: such a mesh is in millimetres.
-_MAX_EXTENT = 20.0
+# No link is longer, metres, and nothing that an arm carries: such a mesh is in millimetres.
+_LONGEST_LINK, _LONGEST_OBJECT = 20.0, 5.0
+_MOST_BYTES = 2**26  # of a mesh file: 64 MiB, or 1.3 million triangles as STL
+_MOST_TRIANGLES = 10_000_000
+# trimesh also reads archives and formats of its own, which stand for more than they hold.
+_FORMATS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb", ".gltf")
 # What rounding makes of triangles without any, as a share of the extent squared.
 _NO_AREA = 1e-12
 _logger = logging.getLogger(__name__)
@@ -76,7 +80,7 @@ class MeshFile:
                 with an area, or is too large to be in metres.
         """
         path = self.require()
-        with reading(path, f"a usable mesh of link '{self.link}'", RobotError, MOST_BYTES):
+        with reading(path, f"a usable mesh of link '{self.link}'", RobotError, _MOST_BYTES):
             return self._local(path)
 
     def _local(self, path: Path) -> Any:
@@ -94,7 +98,7 @@ class MeshFile:
         local.apply_transform(self.T_link)
         if self.scale.prod() < 0.0:
             local.invert()
-        extent = float(np.ptp(read_triangles(local, what, _MAX_EXTENT), axis=(0, 1)).max())
+        extent = float(np.ptp(read_triangles(local, what, _LONGEST_LINK), axis=(0, 1)).max())
         if not local.area > _NO_AREA * extent**2:
             raise RobotError(
                 f"{what}: the mesh has no area, its triangles are lines or points; give a mesh "
@@ -203,3 +207,140 @@ def _names(package_dirs: PackageDirs, reference: str) -> bool:
     return any(
         Path(root).absolute().name == package or (Path(root) / package).is_dir() for root in given
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PrimitiveGeometry:
+    """One solid of a link.
+
+    Attributes:
+        kind: ``"box"``, ``"cylinder"`` (axis z, centred) or ``"sphere"``.
+        size: Metres. Box: the three edge lengths; cylinder: radius and length;
+            sphere: radius.
+        T_link: Pose of the solid in its link's frame, (4, 4).
+        padding: Metres by which the solid is grown all around: it is every point at most so
+            far from the shape of ``size``, so its edges are round.
+    """
+
+    kind: Literal["box", "cylinder", "sphere"]
+    size: tuple[float, ...]
+    T_link: Float[np.ndarray, "4 4"]
+    padding: float = 0.0
+
+    def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Exact signed distance of points to the solid.
+
+        Args:
+            points: (n, 3) positions in the link's frame, metres.
+
+        Returns:
+            (n,) metres, negative inside.
+        """
+        local = (points - self.T_link[:3, 3]) @ self.T_link[:3, :3]
+        if self.kind == "sphere":
+            return np.linalg.norm(local, axis=1) - self.size[0] - self.padding
+        if self.kind == "box":
+            excess = np.abs(local) - 0.5 * np.asarray(self.size)
+        else:
+            radius, length = self.size
+            radial = np.linalg.norm(local[:, :2], axis=1) - radius
+            excess = np.stack([radial, np.abs(local[:, 2]) - 0.5 * length], axis=1)
+        outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
+        return outside + np.minimum(excess.max(axis=1), 0.0) - self.padding
+
+    def triangles(self, sides: int = 32) -> Float[np.ndarray, "f 3 3"]:
+        """A closed surface around the solid without its padding, link frame, metres.
+
+        Exact for a box. A cylinder becomes a prism around it, a sphere a polyhedron around
+        it (of 1280 faces, half a percent larger), so what holds them holds the solid.
+
+        Args:
+            sides: Of the prism; its edges stand out by (pi / sides)^2 / 2 of the radius.
+        """
+        import trimesh
+
+        if self.kind == "box":
+            mesh = trimesh.creation.box(self.size)
+        elif self.kind == "cylinder":
+            radius, length = self.size
+            wide = radius / np.cos(np.pi / sides) * (1.0 + 1e-9)
+            mesh = trimesh.creation.cylinder(wide, length, sections=sides)
+        else:
+            mesh = trimesh.creation.icosphere(subdivisions=3)
+            nearest = np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0]).min()
+            mesh.apply_scale(self.size[0] / nearest * (1.0 + 1e-9))
+        local = np.asarray(mesh.triangles, dtype=np.float64)
+        return local @ self.T_link[:3, :3].T + self.T_link[:3, 3]
+
+    def bounding_radius(self) -> float:
+        """Radius in metres of the ball around the solid's centre that holds it."""
+        if self.kind == "sphere":
+            return self.size[0] + self.padding
+        if self.kind == "box":
+            return float(0.5 * np.linalg.norm(self.size)) + self.padding
+        return float(np.hypot(self.size[0], 0.5 * self.size[1])) + self.padding
+
+
+def read_scene(path: Path) -> Any:
+    """What a mesh file holds, as a ``trimesh.Scene``; call it inside of `reading`.
+
+    Raises:
+        RobotError: Another format, or more triangles than any link has. Else whatever the
+            format's reader raises.
+    """
+    import trimesh
+
+    format = path.suffix.lower()
+    if format not in _FORMATS:
+        raise RobotError(
+            f"'{path}' is a mesh of format {format!r}; formats that are read: {', '.join(_FORMATS)}"
+        )
+    if format == ".dae":
+        refuse_growing_scene(path)
+    # Processing would cut out vertices that are not finite, and their faces, in silence.
+    scene = trimesh.load_scene(path, process=False)
+    sizes = {name: len(getattr(part, "faces", ())) for name, part in scene.geometry.items()}
+    count = sum(sizes[scene.graph[node][1]] for node in scene.graph.nodes_geometry)
+    if count > _MOST_TRIANGLES:
+        raise RobotError(f"'{path}' has {count:,} triangles; at most {_MOST_TRIANGLES:,} are read")
+    return scene
+
+
+def read_triangles(
+    mesh: Any, what: str, max_extent: float = _LONGEST_OBJECT
+) -> Float[np.ndarray, "f 3 3"]:
+    """Triangles of a mesh or of a mesh file, metres.
+
+    Args:
+        mesh: A ``trimesh.Trimesh``, or the path of a file that trimesh reads.
+        what: Whose mesh it is, for messages.
+        max_extent: Metres; what is longer is not in metres.
+
+    Raises:
+        RobotError: There is no such file, it holds no triangles, a vertex is not finite,
+            or it is larger than `max_extent`.
+    """
+    if isinstance(mesh, str | Path):
+        path = Path(mesh)
+        if not path.is_file():
+            raise RobotError(f"{what}: no mesh file at '{path}'; give an existing file")
+        with reading(path, f"a usable mesh of {what}", RobotError, _MOST_BYTES):
+            return read_triangles(read_scene(path).to_mesh(), f"{what}, '{path}'", max_extent)
+    vertices = np.asarray(getattr(mesh, "vertices", ()), dtype=np.float64)
+    faces = np.asarray(getattr(mesh, "faces", ()))
+    if len(vertices) == 0 or len(faces) == 0:
+        raise RobotError(
+            f"{what}: a {type(mesh).__name__} without triangles; give a trimesh.Trimesh or the "
+            "path of a mesh file (for a scene: scene.to_mesh())"
+        )
+    triangles = vertices[faces]
+    if not np.isfinite(triangles).all():
+        raise RobotError(f"{what}: the mesh has vertices that are not finite")
+    extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+    if not 0.0 < extent <= max_extent:
+        raise RobotError(
+            f"{what}: the mesh is {extent:.6g} m long; it must be more than 0 and at most "
+            f'{max_extent:g} m (a mesh in millimetres: mesh.apply_scale(0.001), or scale="0.001 '
+            '0.001 0.001" in a URDF)'
+        )
+    return np.asarray(triangles, dtype=np.float64)

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A link's surface as spheres are fitted to it: small triangles, and what is inside of them."""
+"""A link's surface: its triangles, small ones and points of them, and what is inside."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
 
 # Cells along the edge of a cube as large as a link's box, and along its longest edge.
 _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
@@ -15,6 +18,7 @@ _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
 # smaller: a sphere cannot be finer than what it must hold.
 _EDGE, _FINE, _FINEST = 1.5, 2.0, 0.5
 _NEXT_TO_NONE = 0.15
+_SAMPLES = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +47,7 @@ class Surface:
 
     @classmethod
     def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> Surface:
+        """Cut a surface so that spheres which stand out by the tolerance can hold its parts."""
         from scipy import ndimage
         from scipy.spatial import cKDTree
 
@@ -145,3 +150,38 @@ def halved_triangles(
     a, b, c = (triangles[rows, (start + k) % 3] for k in range(3))
     middle = 0.5 * (a + b)
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+
+
+def link_triangles(
+    solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
+) -> Float[np.ndarray, "f 3 3"]:
+    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be used.
+    """
+    parts = [solid.triangles(sides) for solid in solids] + [mesh.triangles() for mesh in meshes]
+    return np.concatenate([np.empty((0, 3, 3)), *parts])
+
+
+def surface_samples(
+    triangles: Float[np.ndarray, "f 3 3"], count: int = _SAMPLES, seed: int = 0
+) -> Float[np.ndarray, "n 3"]:
+    """Points of a surface: `count` uniform by area, and every corner."""
+    points, _ = drawn_points(triangles, count, seed)
+    return np.concatenate([points, triangles.reshape(-1, 3)])
+
+
+def drawn_points(
+    triangles: Float[np.ndarray, "f 3 3"], count: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of a surface, uniform by area, and the unit normals of their triangles."""
+    rng = np.random.default_rng(seed)
+    edges = triangles[:, 1:] - triangles[:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    area = np.linalg.norm(normal, axis=1)
+    which = rng.choice(len(triangles), size=count, p=area / area.sum())
+    share = rng.random((count, 2))
+    share = np.where(share.sum(axis=1, keepdims=True) > 1.0, 1.0 - share, share)
+    points = triangles[which, 0] + np.einsum("nk,nkj->nj", share, edges[which])
+    return points, normal[which] / area[which, None]

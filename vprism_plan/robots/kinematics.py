@@ -1,0 +1,455 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot as flat arrays, and where its frames, links and spheres are for a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from vprism_plan._read_only import make_read_only
+from vprism_plan.errors import RobotError
+from vprism_plan.robots.sphere_files import LinkSpheres
+from vprism_plan.robots.urdf import Joint, RobotModel
+
+if TYPE_CHECKING:
+    import torch
+
+KIND_FIXED = 0
+KIND_REVOLUTE = 1
+KIND_PRISMATIC = 2
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicArrays:
+    """A kinematic tree as C-contiguous float64/int64 arrays, read-only.
+
+    Frame 0 is the robot's base; every other frame belongs to one moving joint,
+    parents before children. Fixed joints, and joints locked at a value, are
+    merged into the offsets, so a walk over the frames costs one product per
+    moving joint. The pose of frame f in the world is
+
+        T_f = T_parent(f) @ [R_off, t_off] @ motion(axis, value),
+        value = q_mult * q[q_index] + q_offset       (mimic joints),
+
+    with ``T_0 = [base_R, base_t]``. Metres and radians.
+
+    Attributes:
+        base_R: Rotation of the base in the world.
+        base_t: Position of the base in the world, metres.
+        parent: Parent frame, -1 for frame 0.
+        R_off: Joint frame in its parent frame at joint value 0, rotation.
+        t_off: The same, translation in metres.
+        axis: Unit joint axis in the joint frame.
+        kind: 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic.
+        q_index: Index into the configuration, -1 for frame 0.
+        q_mult: Factor on the configuration value (1 unless the joint mimics).
+        q_offset: Offset added to it (0 unless the joint mimics).
+        sphere_frame: Frame each sphere moves with.
+        sphere_center: Centre in that frame, metres.
+        sphere_radius: Radius, metres. Spheres are sorted by (link, radius
+            falling), so the spheres of a link are contiguous.
+        sphere_link: Index into the robot's ``link_names``.
+        link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
+        link_frame: Frame each link moves with.
+        link_center: Centre of a ball that holds all spheres of the link.
+        link_radius: Radius of that ball.
+        link_fixed: True where no joint moves the link.
+        link_padding: Metres of each link's radii that are padding. They count against the
+            world; a pair's gap is that of its spheres plus the padding of both links.
+        pairs: Link pairs (first < second) to test for self-collision.
+        lower: Lower joint limits; -pi for continuous joints.
+        upper: Upper joint limits; +pi for continuous joints.
+        continuous: True where the joint turns without limit.
+    """
+
+    base_R: Float[np.ndarray, "3 3"]  # noqa: N815
+    base_t: Float[np.ndarray, "3"]
+    parent: Int[np.ndarray, "frames"]
+    R_off: Float[np.ndarray, "frames 3 3"]
+    t_off: Float[np.ndarray, "frames 3"]
+    axis: Float[np.ndarray, "frames 3"]
+    kind: Int[np.ndarray, "frames"]
+    q_index: Int[np.ndarray, "frames"]
+    q_mult: Float[np.ndarray, "frames"]
+    q_offset: Float[np.ndarray, "frames"]
+    sphere_frame: Int[np.ndarray, "spheres"]
+    sphere_center: Float[np.ndarray, "spheres 3"]
+    sphere_radius: Float[np.ndarray, "spheres"]
+    sphere_link: Int[np.ndarray, "spheres"]
+    link_start: Int[np.ndarray, "links_plus_one"]
+    link_frame: Int[np.ndarray, "links"]
+    link_center: Float[np.ndarray, "links 3"]
+    link_radius: Float[np.ndarray, "links"]
+    link_fixed: Bool[np.ndarray, "links"]
+    link_padding: Float[np.ndarray, "links"]
+    pairs: Int[np.ndarray, "pairs 2"]
+    lower: Float[np.ndarray, "dof"]
+    upper: Float[np.ndarray, "dof"]
+    continuous: Bool[np.ndarray, "dof"]
+
+    def __post_init__(self) -> None:
+        """Keep users of the robot's limits and radii from changing those of every checker."""
+        make_read_only(self.__dict__)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        make_read_only(state)
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """Where a link sits: constant pose ``T`` in the moving frame ``frame``."""
+
+    frame: int
+    T: np.ndarray
+
+
+def joint_motion(joint: Joint, value: float) -> Float[np.ndarray, "4 4"]:
+    """Pose of a joint's child frame in its joint frame at a value (rad or m)."""
+    T = np.eye(4)
+    if joint.kind == "prismatic":
+        T[:3, 3] = value * joint.axis
+    else:
+        T[:3, :3] = rotation(joint.axis, np.float64(value))
+    return T
+
+
+def rotation(
+    axis: Float[np.ndarray, "3"], angle: Float[np.ndarray, "*batch"] | np.float64
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation matrices about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    return np.eye(3) + s * K + (1.0 - c) * (K @ K)
+
+
+def build_arrays(
+    model: RobotModel,
+    active: Sequence[str],
+    locked: Mapping[str, float],
+    spheres: LinkSpheres,
+    base_pose: Float[np.ndarray, "4 4"],
+) -> tuple[KinematicArrays, dict[str, Attachment]]:
+    """Flatten a robot; pairs of links to test come later.
+
+    Args:
+        model: The tree.
+        active: Joints of the configuration, in its order.
+        locked: Value of every other actuated joint.
+        spheres: Spheres per link; its keys, in order, are the collision links.
+        base_pose: Pose of the robot's root link in the world.
+
+    Returns:
+        The arrays, and where each URDF link sits.
+    """
+    frames: list[tuple[int, np.ndarray, np.ndarray, int, int, float, float]] = [
+        (-1, np.eye(4), np.array([0.0, 0.0, 1.0]), KIND_FIXED, -1, 0.0, 0.0)
+    ]
+    links = {model.root: Attachment(0, np.eye(4))}
+    for joint in model.joints:
+        parent = links[joint.parent]
+        T = parent.T @ joint.T_origin
+        if not joint.moves:
+            links[joint.child] = Attachment(parent.frame, T)
+            continue
+        driver, factor, shift = model.resolve_mimic(joint.name)
+        if driver in active:
+            kind = KIND_PRISMATIC if joint.kind == "prismatic" else KIND_REVOLUTE
+            index = list(active).index(driver)
+            frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
+            links[joint.child] = Attachment(len(frames) - 1, np.eye(4))
+        else:
+            moved = T @ joint_motion(joint, factor * locked[driver] + shift)
+            links[joint.child] = Attachment(parent.frame, moved)
+    chosen = [model.joint_map[name] for name in active]
+    offsets = np.array([frame[1] for frame in frames])
+    arrays = KinematicArrays(
+        base_R=_floats(base_pose[:3, :3]),
+        base_t=_floats(base_pose[:3, 3]),
+        parent=_ints([frame[0] for frame in frames]),
+        R_off=_floats(offsets[:, :3, :3]),
+        t_off=_floats(offsets[:, :3, 3]),
+        axis=_floats([frame[2] for frame in frames]),
+        kind=_ints([frame[3] for frame in frames]),
+        q_index=_ints([frame[4] for frame in frames]),
+        q_mult=_floats([frame[5] for frame in frames]),
+        q_offset=_floats([frame[6] for frame in frames]),
+        **_sphere_arrays(spheres, links),
+        pairs=np.empty((0, 2), dtype=np.int64),
+        lower=_floats([joint.lower for joint in chosen]),
+        upper=_floats([joint.upper for joint in chosen]),
+        continuous=np.array([joint.kind == "continuous" for joint in chosen], dtype=bool),
+    )
+    return arrays, links
+
+
+def _floats(values: object) -> np.ndarray:
+    return np.array(values, dtype=np.float64, order="C")
+
+
+def _ints(values: object) -> np.ndarray:
+    return np.array(values, dtype=np.int64, order="C")
+
+
+def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dict[str, np.ndarray]:
+    frames, centers, radii, owner, start = [], [], [], [], [0]
+    bounds = []
+    for index, (name, unsorted) in enumerate(spheres.items()):
+        sits = links[name]
+        rows = unsorted[np.argsort(-unsorted[:, 3], kind="stable")]
+        local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
+        frames += [sits.frame] * len(rows)
+        centers.append(local)
+        radii.append(rows[:, 3])
+        owner += [index] * len(rows)
+        start.append(start[-1] + len(rows))
+        bounds.append(bounding_ball(local, rows[:, 3]))
+    link_frame = _ints([links[name].frame for name in spheres])
+    return {
+        "sphere_frame": _ints(frames),
+        "sphere_center": _floats(np.vstack(centers)),
+        "sphere_radius": _floats(np.concatenate(radii)),
+        "sphere_link": _ints(owner),
+        "link_start": _ints(start),
+        "link_frame": link_frame,
+        "link_center": _floats([ball[0] for ball in bounds]),
+        "link_radius": _floats([ball[1] for ball in bounds]),
+        "link_fixed": link_frame == 0,
+        "link_padding": np.zeros(len(link_frame)),
+    }
+
+
+def bounding_ball(
+    centers: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """A small ball that holds a set of balls (Badoiu and Clarkson's iteration).
+
+    Returns:
+        Centre, and a radius rounded up so that every ball is held.
+    """
+    center = centers.mean(axis=0)
+    best, radius = center, np.inf
+    for step in range(1, 200):
+        reach = np.linalg.norm(centers - center, axis=1) + radii
+        far = int(np.argmax(reach))
+        if reach[far] < radius:
+            best, radius = center, float(reach[far])
+        direction = centers[far] - center
+        length = float(np.linalg.norm(direction))
+        if length == 0.0:
+            break
+        center = center + direction / length * (reach[far] / (step + 1.0))
+    return best, radius * (1.0 + 1e-12)
+
+
+def frame_poses(
+    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"]
+) -> tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]]:
+    """World poses of all frames for a batch of configurations.
+
+    Args:
+        arrays: The robot.
+        q: (n, dof) radians or metres.
+
+    Returns:
+        Rotations (n, frames, 3, 3) and positions (n, frames, 3) in the world.
+    """
+    n, count = len(q), len(arrays.parent)
+    R, t = np.empty((n, count, 3, 3)), np.empty((n, count, 3))
+    R[:, 0], t[:, 0] = arrays.base_R, arrays.base_t
+    for f in range(1, count):
+        p = arrays.parent[f]
+        value = arrays.q_mult[f] * q[:, arrays.q_index[f]] + arrays.q_offset[f]
+        R[:, f] = R[:, p] @ arrays.R_off[f]
+        t[:, f] = t[:, p] + R[:, p] @ arrays.t_off[f]
+        if arrays.kind[f] == KIND_PRISMATIC:
+            t[:, f] += value[:, None] * (R[:, f] @ arrays.axis[f])
+        else:
+            R[:, f] = R[:, f] @ rotation(arrays.axis[f], value)
+    return R, t
+
+
+def place(
+    poses: tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]],
+    frame: Int[np.ndarray, "m"],
+    points: Float[np.ndarray, "m 3"],
+) -> Float[np.ndarray, "n m 3"]:
+    """World positions of points that move with frames, from :func:`frame_poses`."""
+    R, t = poses
+    return np.asarray((R[:, frame] @ points[:, :, None])[..., 0] + t[:, frame])
+
+
+def only_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+    """Spheres of these links only, in this order; all joints, and no pairs."""
+    counts = np.diff(arrays.link_start)[links]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    rows = np.arange(starts[-1]) + np.repeat(arrays.link_start[links] - starts[:-1], counts)
+    of_spheres = ("sphere_frame", "sphere_center", "sphere_radius")
+    of_links = ("link_frame", "link_center", "link_radius", "link_fixed", "link_padding")
+    return replace(
+        arrays,
+        **{name: getattr(arrays, name)[rows] for name in of_spheres},
+        **{name: getattr(arrays, name)[links] for name in of_links},
+        sphere_link=np.repeat(np.arange(len(links)), counts),
+        link_start=starts,
+        pairs=np.empty((0, 2), dtype=np.int64),
+    )
+
+
+def reach_bound(arrays: KinematicArrays) -> float:
+    """No sphere reaches farther from the base origin than this, metres.
+
+    The sum of offsets along each branch, plus the travel of its prismatic joints,
+    plus how far the spheres stand off their frame: the triangle inequality.
+    """
+    reach = np.zeros(len(arrays.parent))
+    for f in range(1, len(reach)):
+        reach[f] = reach[arrays.parent[f]] + np.linalg.norm(arrays.t_off[f])
+        if arrays.kind[f] == KIND_PRISMATIC:
+            ends = np.array([arrays.lower[arrays.q_index[f]], arrays.upper[arrays.q_index[f]]])
+            reach[f] += np.abs(arrays.q_mult[f] * ends + arrays.q_offset[f]).max()
+    outer = np.linalg.norm(arrays.sphere_center, axis=1) + arrays.sphere_radius
+    return float((reach[arrays.sphere_frame] + outer).max())
+
+
+class TorchKinematics:
+    """Sphere centres in the base frame as a function of a torch configuration.
+
+    The chain is built from float64 matrices, not from URDF text: the URDF reader
+    of pytorch-kinematics rounds offsets to float32, ignores mimic joints and gives
+    continuous joints with an effort limit the range (0, 0). One chain is kept per
+    dtype and device.
+    """
+
+    def __init__(self, arrays: KinematicArrays) -> None:
+        self._arrays = arrays
+        self._chains: dict[tuple[torch.dtype, torch.device], _Chain] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_arrays": self._arrays, "_chains": {}}
+
+    def sphere_centers(self, q: torch.Tensor) -> torch.Tensor:
+        """(B, dof) -> (B, S, 3) in the base frame, metres."""
+        key = (q.dtype, q.device)
+        if key not in self._chains:
+            self._chains[key] = _Chain(self._arrays, *key)
+        return self._chains[key](q)
+
+
+class _Chain:
+    def __init__(self, arrays: KinematicArrays, dtype: torch.dtype, device: torch.device) -> None:
+        import torch
+
+        if dtype not in (torch.float32, torch.float64):
+            raise RobotError(f"q has dtype {dtype}; valid: torch.float32, torch.float64")
+
+        def tensor(values: np.ndarray) -> torch.Tensor:
+            return torch.tensor(values, device=device).to(
+                dtype if values.dtype.kind == "f" else torch.int64
+            )
+
+        chain = _build_chain(arrays, dtype, device)
+        names = chain.get_joint_parameter_names()
+        order = np.array([int(name[1:]) for name in names])
+        self._chain = chain
+        self._q_index = tensor(arrays.q_index[order])
+        self._q_mult = tensor(arrays.q_mult[order])
+        self._q_offset = tensor(arrays.q_offset[order])
+        placed = [chain.frame_to_idx[f"f{f}"] for f in arrays.sphere_frame]
+        self._frame = torch.tensor(placed, device=device)
+        self._center = tensor(arrays.sphere_center)
+
+    def __call__(self, q: torch.Tensor) -> torch.Tensor:
+        import torch
+
+        joints = q[:, self._q_index] * self._q_mult + self._q_offset
+        # The chain's own backward is analytic and wrong when differentiated again;
+        # the plain graph is right at every order.
+        poses = self._chain.forward_kinematics_tensor(joints, analytical_grad=False)[self._frame]
+        rotated = torch.einsum("sbij,sj->bsi", poses[..., :3, :3], self._center)
+        return rotated + poses[..., :3, 3].transpose(0, 1)
+
+
+def _build_chain(arrays: KinematicArrays, dtype: torch.dtype, device: torch.device) -> Any:
+    """The frames as a pytorch-kinematics chain; joint and frame f are "j<f>", "f<f>"."""
+    import torch
+    from pytorch_kinematics.chain import Chain
+    from pytorch_kinematics.frame import Frame, Joint
+    from pytorch_kinematics.frame import Link as ChainLink
+    from pytorch_kinematics.transforms import Transform3d
+
+    nodes: list[Frame] = []
+    for f in range(len(arrays.parent)):
+        node = Frame(f"f{f}", link=ChainLink(f"f{f}"))
+        if f > 0:
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = arrays.R_off[f], arrays.t_off[f]
+            node.joint = Joint(
+                f"j{f}",
+                offset=Transform3d(matrix=torch.tensor(matrix, dtype=dtype, device=device)),
+                joint_type="prismatic" if arrays.kind[f] == KIND_PRISMATIC else "revolute",
+                axis=torch.tensor(arrays.axis[f], dtype=dtype, device=device),
+                dtype=dtype,
+                device=device,
+            )
+            nodes[arrays.parent[f]].add_child(node)
+        nodes.append(node)
+    return Chain(nodes[0], dtype=dtype, device=device)
+
+
+def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
+    """Return joint values as a fresh float64 array, C-contiguous and writeable.
+
+    A copy even of what is such an array: numba would compile its kernels once more for a
+    read-only one. Neither the shape nor that values are finite is looked at.
+
+    Args:
+        values: an array, a tensor, a list or a tuple of real numbers.
+        robot: whose joints the message names.
+        what: for the message, with its article.
+
+    Raises:
+        RobotError: they are not real numbers, ragged, too large for a float, masked, or a
+            tensor that requires a gradient.
+    """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values.copy(order="C")
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind == "c":
+            raise TypeError("complex numbers")
+        if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+            raise TypeError("some values are masked")
+        return np.array(array, dtype=np.float64, order="C")
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise RobotError(
+            f"{what} cannot be read from {type(values).__name__}: {error}; give "
+            f"real numbers for the {robot.dof} joints {list(robot.joint_names)}"
+        ) from error
+
+
+def rigid_pose(pose: ArrayLike, what: str = "base_pose") -> Float[np.ndarray, "4 4"]:
+    """A copy of a pose, refused unless it is a proper rigid motion."""
+    try:
+        T = np.array(pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RobotError(f"{what} is not a (4, 4) array: {error}") from error
+    if T.shape != (4, 4):
+        raise RobotError(f"{what} has shape {T.shape}; expected (4, 4)")
+    if not np.isfinite(T).all():
+        raise RobotError(f"{what} holds NaN or infinite values; give a rigid 4x4 pose")
+    R = T[:3, :3]
+    drift = float(np.abs(R @ R.T - np.eye(3)).max())
+    if drift > 1e-6 or np.linalg.det(R) < 0 or not np.array_equal(T[3], [0, 0, 0, 1]):
+        raise RobotError(
+            f"{what} is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
+            f"determinant {np.linalg.det(R):.6g} (expected 1) and last row {T[3].tolist()} "
+            "(expected [0, 0, 0, 1])"
+        )
+    return T
