@@ -6,7 +6,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,12 +14,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import PrimitiveGeometry, read_triangles
+from vprism_plan.robots.geometry import read_triangles
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,
     TorchKinematics,
     bounding_ball,
+    in_frame,
+    only_links,
     rigid_pose,
 )
 from vprism_plan.robots.pairs import NEVER, touching_pairs
@@ -33,24 +35,25 @@ def padded(
 ) -> Any:
     """See :meth:`Robot.with_padding`."""
     names = robot.link_names
-    pads = per_link(padding, 0.0, "padding", names, robot.links_of)
-    scales = per_link(scale, 1.0, "scale", names, robot.links_of)
+    pads, scales = _per_link(robot, padding, 0.0, "padding"), _per_link(robot, scale, 1.0, "scale")
     arrays = grown(robot.arrays, scales, pads)
     larger = {name for name, factor in zip(names, scales, strict=True) if factor > 1.0}
+    # "Never" was found for links of another size.
     again = [
         pair
         for pair in robot._sampled_pairs
         if robot.disabled_pairs.get(pair) == NEVER and pair & larger
     ]
-    arrays = dataclasses.replace(arrays, pairs=_with_pairs(arrays.pairs, again, names))
+    added = [sorted(names.index(name) for name in pair) for pair in again]
+    arrays = dataclasses.replace(arrays, pairs=_with_pairs(arrays, added))
     geometry, meshes = dict(robot.geometry), dict(robot.meshes)
     for index, name in enumerate(names):
-        T, scale = robot._links[name].T, float(scales[index])
+        T, factor, pad = robot._links[name].T, float(scales[index]), float(pads[index])
         about = (robot.arrays.link_center[index] - T[:3, 3]) @ T[:3, :3]
         if name in geometry:
-            geometry[name] = grown_solids(geometry[name], about, scale, float(pads[index]))
-        if name in meshes and scale != 1.0:
-            meshes[name] = tuple(file.scaled(about, scale) for file in meshes[name])
+            geometry[name] = tuple(solid.grown(about, factor, pad) for solid in geometry[name])
+        if name in meshes and factor != 1.0:
+            meshes[name] = tuple(file.scaled(about, factor) for file in meshes[name])
     before = touching_pairs(robot.arrays, robot.neutral, names)
     touching = touching_pairs(arrays, robot.neutral, names) - before
     if touching:
@@ -66,40 +69,30 @@ def padded(
 
 
 def _with_pairs(
-    pairs: Int[np.ndarray, "pairs 2"], again: Sequence[frozenset[str]], names: tuple[str, ...]
-) -> Int[np.ndarray, "more 2"]:
-    """Pairs with others added: "Never" was found for links of another size."""
-    added = [sorted(names.index(name) for name in pair) for pair in again]
-    both = np.vstack([pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
+    arrays: KinematicArrays, added: Sequence[Sequence[int]]
+) -> Int[np.ndarray, "pairs 2"]:
+    """The pairs that are tested, with others added; sorted."""
+    both = np.vstack([arrays.pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
     return np.ascontiguousarray(both[np.lexsort((both[:, 1], both[:, 0]))])
 
 
-def per_link(
-    value: float | Mapping[str, float],
-    default: float,
-    what: str,
-    link_names: tuple[str, ...],
-    links_of: Callable[[str], tuple[str, ...]],
+def _per_link(
+    robot: Any, value: float | Mapping[str, float], default: float, what: str
 ) -> Float[np.ndarray, "links"]:
     """One number per link, from one for all or from a table of links and groups.
 
     A link's own entry outranks that of a group; of several groups the largest value counts.
-
-    Raises:
-        RobotError: A name is unknown, or a value is not a number that `what` may have.
     """
+    names = robot.link_names
     if not isinstance(value, Mapping):
-        return np.full(len(link_names), _allowed(value, what, "all links"))
-    result = np.full(len(link_names), default)
-    named = np.zeros(len(link_names), dtype=bool)
-    for name in sorted(value, key=lambda key: key in link_names):
+        return np.full(len(names), _allowed(value, what, "all links"))
+    found: dict[str, float] = {}
+    for name in sorted(value, key=lambda key: key in names):
         number = _allowed(value[name], what, repr(name))
-        for link in links_of(name):
-            index = link_names.index(link)
-            together = named[index] and name not in link_names
-            result[index] = max(result[index], number) if together else number
-            named[index] = True
-    return result
+        for link in robot.links_of(name):
+            own = name in names or link not in found
+            found[link] = number if own else max(found[link], number)
+    return np.array([found.get(name, default) for name in names], dtype=np.float64)
 
 
 def _allowed(value: float, what: str, whose: str) -> float:
@@ -171,27 +164,6 @@ def _scaled(
     return about + scaled[:, None] * arm, np.where(apart, both * (1.0 + 1e-12), big)
 
 
-def grown_solids(
-    solids: tuple[PrimitiveGeometry, ...],
-    about: Float[np.ndarray, "3"],
-    scale: float,
-    padding: float,
-) -> tuple[PrimitiveGeometry, ...]:
-    """The solids of a link scaled about a point of its frame, then padded."""
-    result = []
-    for solid in solids:
-        T = solid.T_link.copy()
-        T[:3, 3] = about + scale * (T[:3, 3] - about)
-        size = tuple(scale * edge for edge in solid.size)
-        result.append(
-            PrimitiveGeometry(solid.kind, size, T, padding=scale * solid.padding + padding)
-        )
-    return tuple(result)
-
-
-_logger = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True, eq=False)
 class Surface:
     """Triangles of a mesh, metres."""
@@ -220,12 +192,15 @@ def attached(
     robot: Any,
     name: str,
     link: str,
-    held: Held,
+    spheres: Any,
+    mesh: Any,
     pose: Any,
     touch_links: Sequence[str],
+    max_spheres: int,
 ) -> Any:
     """See :meth:`Robot.attach`."""
-    what = described(name)
+    what = f"attached object {name!r}"
+    held = _held(what, spheres, mesh, max_spheres)
     if not isinstance(name, str) or not name or name in robot._links or name in robot.groups:
         raise RobotError(f"{what}: an object needs a name of its own, no link's or group's")
     if link not in robot._links:
@@ -239,8 +214,8 @@ def attached(
     reasons = dict.fromkeys(siblings, "Attached to the same link") | {link: "Attached"}
     for touched in (member for entry in touch_links for member in _members(robot, entry)):
         reasons.setdefault(touched, "Touch link")
-    untested = [i for i, other in enumerate(robot.link_names) if other in reasons]
-    arrays = with_link(robot.arrays, sits, held.spheres, untested)
+    tested = [i for i, other in enumerate(robot.link_names) if other not in reasons]
+    arrays = _with_link(robot.arrays, sits, held.spheres, tested)
     names = (*robot.link_names, name)
     touching = [p for p in touching_pairs(arrays, robot.neutral, names) if name in p]
     if touching:
@@ -269,10 +244,16 @@ def detached(robot: Any, name: str) -> Any:
     carried = [other for other, parent in robot.attached.items() if parent == name]
     if carried:
         raise RobotError(f"{name!r} carries {carried}; detach them first")
-    arrays = without_link(robot.arrays, robot.link_names.index(name))
+    names = tuple(link for link in robot.link_names if link != name)
+    gone = robot.link_names.index(name)
+    pairs = robot.arrays.pairs[(robot.arrays.pairs != gone).all(axis=1)]
+    arrays = dataclasses.replace(
+        only_links(robot.arrays, np.array([robot.link_names.index(link) for link in names])),
+        pairs=np.ascontiguousarray(pairs - (pairs > gone)),
+    )
     return dataclasses.replace(
         robot,
-        link_names=tuple(link for link in robot.link_names if link != name),
+        link_names=names,
         disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if name not in p},
         arrays=arrays,
         attached={other: link for other, link in robot.attached.items() if other != name},
@@ -282,22 +263,11 @@ def detached(robot: Any, name: str) -> Any:
     )
 
 
-def described(name: str) -> str:
-    """How messages call an object."""
-    return f"attached object {name!r}"
-
-
-def held_object(name: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
-    """The shape of an object from its spheres or its mesh.
-
-    Raises:
-        RobotError: Neither or both are given, or what is given is unusable.
-    """
-    what = described(name)
+def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
     if (spheres is None) == (mesh is None):
         raise RobotError(f"{what}: give either spheres or a mesh")
     if mesh is None:
-        return Held(sphere_rows(spheres, what))
+        return Held(_sphere_rows(spheres, what))
     if max_spheres < 1:
         raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
     triangles = read_triangles(mesh, what)
@@ -311,27 +281,20 @@ def _members(robot: Any, name: str) -> tuple[str, ...]:
     return tuple(robot.groups[name] if name in robot.groups else robot.links_of(name))
 
 
-def with_link(
+def _with_link(
     arrays: KinematicArrays,
     sits: Attachment,
     rows: Float[np.ndarray, "n 4"],
-    untested: Iterable[int],
+    tested: Sequence[int],
 ) -> KinematicArrays:
-    """Add a link at the end: spheres ``rows`` in its own frame, which sits at ``sits``.
-
-    It is tested against every link whose index is not in ``untested``.
-    """
-    rows = rows[np.argsort(-rows[:, 3], kind="stable")]
-    local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
-    center, radius = bounding_ball(local, rows[:, 3])
-    index, left_out = len(arrays.link_frame), set(untested)
-    added = [(other, index) for other in range(index) if other not in left_out]
-    pairs = np.vstack([arrays.pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
+    """Add a link at the end: spheres in its own frame, to be tested against some links."""
+    local, radii, center, radius = in_frame(sits, rows)
+    index = len(arrays.link_frame)
     return dataclasses.replace(
         arrays,
         sphere_frame=np.append(arrays.sphere_frame, np.full(len(rows), sits.frame)),
         sphere_center=np.vstack([arrays.sphere_center, local]),
-        sphere_radius=np.append(arrays.sphere_radius, rows[:, 3]),
+        sphere_radius=np.append(arrays.sphere_radius, radii),
         sphere_link=np.append(arrays.sphere_link, np.full(len(rows), index)),
         link_start=np.append(arrays.link_start, len(arrays.sphere_radius) + len(rows)),
         link_frame=np.append(arrays.link_frame, sits.frame),
@@ -339,40 +302,11 @@ def with_link(
         link_radius=np.append(arrays.link_radius, radius),
         link_fixed=np.append(arrays.link_fixed, sits.frame == 0),
         link_padding=np.append(arrays.link_padding, 0.0),
-        pairs=np.ascontiguousarray(pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]),
+        pairs=_with_pairs(arrays, [(other, index) for other in tested]),
     )
 
 
-def without_link(arrays: KinematicArrays, link: int) -> KinematicArrays:
-    """Take a link's spheres and pairs away; links after it move up by one."""
-    kept = arrays.sphere_link != link
-    count = int(arrays.link_start[link + 1] - arrays.link_start[link])
-    owner = arrays.sphere_link[kept]
-    start = np.delete(arrays.link_start, link + 1)
-    start[link + 1 :] -= count
-    pairs = arrays.pairs[(arrays.pairs != link).all(axis=1)]
-    return dataclasses.replace(
-        arrays,
-        sphere_frame=arrays.sphere_frame[kept],
-        sphere_center=np.ascontiguousarray(arrays.sphere_center[kept]),
-        sphere_radius=arrays.sphere_radius[kept],
-        sphere_link=owner - (owner > link),
-        link_start=start,
-        link_frame=np.delete(arrays.link_frame, link),
-        link_center=np.ascontiguousarray(np.delete(arrays.link_center, link, axis=0)),
-        link_radius=np.delete(arrays.link_radius, link),
-        link_fixed=np.delete(arrays.link_fixed, link),
-        link_padding=np.delete(arrays.link_padding, link),
-        pairs=np.ascontiguousarray(pairs - (pairs > link)),
-    )
-
-
-def sphere_rows(spheres: object, what: str) -> Float[np.ndarray, "n 4"]:
-    """Spheres as an array of rows (x, y, z, radius).
-
-    Raises:
-        RobotError: There are none, or one is not four finite numbers with a positive radius.
-    """
+def _sphere_rows(spheres: object, what: str) -> Float[np.ndarray, "n 4"]:
     try:
         rows = np.array(spheres, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -68,8 +68,7 @@ class MeshFile:
 
     def scaled(self, about: Float[np.ndarray, "3"], factor: float) -> MeshFile:
         """The same mesh larger or smaller by a factor, about a point of the link's frame."""
-        T = self.T_link.copy()
-        T[:3, 3] = about + factor * (T[:3, 3] - about)
+        T = _moved(self.T_link, about, factor)
         return replace(self, scale=factor * self.scale, T_link=T)
 
     def mesh(self) -> Any:
@@ -109,6 +108,14 @@ class MeshFile:
     def triangles(self) -> Float[np.ndarray, "f 3 3"]:
         """Triangles in the link's frame, metres; errors as of :meth:`mesh`."""
         return np.asarray(self.mesh().triangles, dtype=np.float64)
+
+
+def _moved(
+    T_link: Float[np.ndarray, "4 4"], about: Float[np.ndarray, "3"], factor: float
+) -> Float[np.ndarray, "4 4"]:
+    T = T_link.copy()
+    T[:3, 3] = about + factor * (T[:3, 3] - about)
+    return T
 
 
 def _loaded(path: Path, what: str) -> Any:
@@ -271,6 +278,13 @@ class PrimitiveGeometry:
             mesh.apply_scale(self.size[0] / nearest * (1.0 + 1e-9))
         local = np.asarray(mesh.triangles, dtype=np.float64)
         return local @ self.T_link[:3, :3].T + self.T_link[:3, 3]
+
+    def grown(
+        self, about: Float[np.ndarray, "3"], factor: float, padding: float
+    ) -> PrimitiveGeometry:
+        """The solid scaled about a point of the link's frame, then padded."""
+        T, size = _moved(self.T_link, about, factor), tuple(factor * edge for edge in self.size)
+        return PrimitiveGeometry(self.kind, size, T, factor * self.padding + padding)
 
     def bounding_radius(self) -> float:
         """Radius in metres of the ball around the solid's centre that holds it."""

@@ -197,29 +197,30 @@ def _ints(values: object) -> np.ndarray:
     return np.array(values, dtype=np.int64, order="C")
 
 
+def in_frame(
+    sits: Attachment, rows: Float[np.ndarray, "n 4"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "3"], float]:
+    """A link's spheres in the frame that it moves with, radius falling, and a ball around them."""
+    rows = rows[np.argsort(-rows[:, 3], kind="stable")]
+    local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
+    return local, rows[:, 3], *bounding_ball(local, rows[:, 3])
+
+
 def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dict[str, np.ndarray]:
-    frames, centers, radii, owner, start = [], [], [], [], [0]
-    bounds = []
-    for index, (name, unsorted) in enumerate(spheres.items()):
-        sits = links[name]
-        rows = unsorted[np.argsort(-unsorted[:, 3], kind="stable")]
-        local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
-        frames += [sits.frame] * len(rows)
-        centers.append(local)
-        radii.append(rows[:, 3])
-        owner += [index] * len(rows)
-        start.append(start[-1] + len(rows))
-        bounds.append(bounding_ball(local, rows[:, 3]))
+    centers, radii, ball_centers, ball_radii = zip(
+        *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
+    )
+    counts = [len(rows) for rows in radii]
     link_frame = _ints([links[name].frame for name in spheres])
     return {
-        "sphere_frame": _ints(frames),
+        "sphere_frame": np.repeat(link_frame, counts),
         "sphere_center": _floats(np.vstack(centers)),
         "sphere_radius": _floats(np.concatenate(radii)),
-        "sphere_link": _ints(owner),
-        "link_start": _ints(start),
+        "sphere_link": np.repeat(np.arange(len(counts)), counts),
+        "link_start": _ints([0, *np.cumsum(counts)]),
         "link_frame": link_frame,
-        "link_center": _floats([ball[0] for ball in bounds]),
-        "link_radius": _floats([ball[1] for ball in bounds]),
+        "link_center": _floats(ball_centers),
+        "link_radius": _floats(ball_radii),
         "link_fixed": link_frame == 0,
         "link_padding": np.zeros(len(link_frame)),
     }

@@ -461,8 +461,7 @@ class Robot:
         Raises:
             RobotError: The name is taken, a link is unknown, or the shape is unusable.
         """
-        held = changes.held_object(name, spheres, mesh, max_spheres)
-        return changes.attached(self, name, link, held, pose, touch_links)
+        return changes.attached(self, name, link, spheres, mesh, pose, touch_links, max_spheres)
 
     def detach(self, name: str) -> Robot:
         """The same robot without an attached object.
