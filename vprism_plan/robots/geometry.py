@@ -146,24 +146,17 @@ def find_mesh(
     may be another package's file, so it is logged, and not done for a package that
     ``package_dirs`` has. Other names are relative to the URDF's folder.
 
-    Args:
-        filename: The element's attribute.
-        urdf: The URDF file.
-        package_dirs: See :data:`PackageDirs`.
-
     Returns:
         The file or None, and the places where it was looked for.
     """
     scheme, _, rest = filename.rpartition("://")
     folder = urdf.absolute().parent
+    places: list[Path] = []
     guesses: list[Path] = []
     if scheme in ("package", "model"):
-        places = _in_packages(rest, folder, package_dirs)
-        guesses = [] if _names(package_dirs, rest) else _nameless(rest, folder)
+        places, guesses = _in_packages(rest, folder, package_dirs)
     elif scheme in ("", "file"):
         places = [folder / rest]  # an absolute path replaces the folder
-    else:
-        places = []
     found = next((place for place in places if place.is_file()), None)
     if found is None:
         found = next((place for place in guesses if place.is_file()), None)
@@ -177,43 +170,31 @@ def find_mesh(
     return found, [str(place) for place in places] or [filename]
 
 
-def _in_packages(reference: str, folder: Path, package_dirs: PackageDirs) -> list[Path]:
+def _in_packages(
+    reference: str, folder: Path, package_dirs: PackageDirs
+) -> tuple[list[Path], list[Path]]:
+    """Where a package's file may be, and where it may be if no folder has the package's name."""
     package, _, rest = reference.partition("/")
-    places: list[Path] = []
-    given: Sequence[str | Path]
+    folders: list[Path] = []
+    given: list[Path] = []
     if isinstance(package_dirs, Mapping):
-        given = []
-        if package in package_dirs:
-            places.append(Path(package_dirs[package]) / rest)
-    elif package_dirs is None:
-        given = []
-    else:
-        given = [package_dirs] if isinstance(package_dirs, str | Path) else package_dirs
-    roots = [Path(root) for root in given]
-    roots += [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
-    for root in roots:
-        places.append(root / package / rest)
-        if root.absolute().name == package:
-            places.append(root / rest)
-    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    places += [Path(prefix) / "share" / package / rest for prefix in prefixes if prefix]
-    return places + [parent / package / rest for parent in [folder, *folder.parents]]
-
-
-def _nameless(reference: str, folder: Path) -> list[Path]:
-    rest = reference.partition("/")[2]
-    return [parent / rest for parent in [folder, *folder.parents]]
-
-
-def _names(package_dirs: PackageDirs, reference: str) -> bool:
-    """Whether the caller says where the package is."""
-    package = reference.partition("/")[0]
-    if package_dirs is None or isinstance(package_dirs, Mapping):
-        return package in (package_dirs or {})
-    given = [package_dirs] if isinstance(package_dirs, str | Path) else package_dirs
-    return any(
-        Path(root).absolute().name == package or (Path(root) / package).is_dir() for root in given
+        folders = [Path(package_dirs[package])] if package in package_dirs else []
+    elif package_dirs is not None:
+        several = [package_dirs] if isinstance(package_dirs, str | Path) else package_dirs
+        given = [Path(root) for root in several]
+    known = bool(folders) or any(
+        root.absolute().name == package or (root / package).is_dir() for root in given
     )
+    for root in [*given, *_paths("ROS_PACKAGE_PATH")]:
+        folders += [root / package, *([root] if root.absolute().name == package else [])]
+    folders += [prefix / "share" / package for prefix in _paths("AMENT_PREFIX_PATH")]
+    above = [folder, *folder.parents]
+    folders += [parent / package for parent in above]
+    return [found / rest for found in folders], [] if known else [up / rest for up in above]
+
+
+def _paths(variable: str) -> list[Path]:
+    return [Path(part) for part in os.environ.get(variable, "").split(os.pathsep) if part]
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,11 +305,6 @@ def read_triangles(
     mesh: Any, what: str, max_extent: float = _LONGEST_OBJECT
 ) -> Float[np.ndarray, "f 3 3"]:
     """Triangles of a mesh or of a mesh file, metres.
-
-    Args:
-        mesh: A ``trimesh.Trimesh``, or the path of a file that trimesh reads.
-        what: Whose mesh it is, for messages.
-        max_extent: Metres; what is longer is not in metres.
 
     Raises:
         RobotError: There is no such file, it holds no triangles, a vertex is not finite,

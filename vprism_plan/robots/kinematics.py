@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.sphere_files import LinkSpheres
-from vprism_plan.robots.urdf import Joint, RobotModel
+from vprism_plan.robots.urdf import RobotModel
 
 if TYPE_CHECKING:
     import torch
@@ -109,16 +109,6 @@ class Attachment:
     T: np.ndarray
 
 
-def joint_motion(joint: Joint, value: float) -> Float[np.ndarray, "4 4"]:
-    """Pose of a joint's child frame in its joint frame at a value (rad or m)."""
-    T = np.eye(4)
-    if joint.kind == "prismatic":
-        T[:3, 3] = value * joint.axis
-    else:
-        T[:3, :3] = rotation(joint.axis, np.float64(value))
-    return T
-
-
 def rotation(
     axis: Float[np.ndarray, "3"], angle: Float[np.ndarray, "*batch"] | np.float64
 ) -> Float[np.ndarray, "*batch 3 3"]:
@@ -165,8 +155,12 @@ def build_arrays(
             frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
             links[joint.child] = Attachment(len(frames) - 1, np.eye(4))
         else:
-            moved = T @ joint_motion(joint, factor * locked[driver] + shift)
-            links[joint.child] = Attachment(parent.frame, moved)
+            value, motion = np.float64(factor * locked[driver] + shift), np.eye(4)
+            if joint.kind == "prismatic":
+                motion[:3, 3] = value * joint.axis
+            else:
+                motion[:3, :3] = rotation(joint.axis, value)
+            links[joint.child] = Attachment(parent.frame, T @ motion)
     chosen = [model.joint_map[name] for name in active]
     offsets = np.array([frame[1] for frame in frames])
     arrays = KinematicArrays(
@@ -252,15 +246,8 @@ def bounding_ball(
 def frame_poses(
     arrays: KinematicArrays, q: Float[np.ndarray, "n dof"]
 ) -> tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]]:
-    """World poses of all frames for a batch of configurations.
-
-    Args:
-        arrays: The robot.
-        q: (n, dof) radians or metres.
-
-    Returns:
-        Rotations (n, frames, 3, 3) and positions (n, frames, 3) in the world.
-    """
+    """World poses of all frames for a batch of configurations (radians or metres): rotations
+    and positions."""
     n, count = len(q), len(arrays.parent)
     R, t = np.empty((n, count, 3, 3)), np.empty((n, count, 3))
     R[:, 0], t[:, 0] = arrays.base_R, arrays.base_t
@@ -322,68 +309,51 @@ def reach_bound(arrays: KinematicArrays) -> float:
 class TorchKinematics:
     """Sphere centres in the base frame as a function of a torch configuration.
 
-    The chain is built from float64 matrices, not from URDF text: the URDF reader
-    of pytorch-kinematics rounds offsets to float32, ignores mimic joints and gives
-    continuous joints with an effort limit the range (0, 0). One chain is kept per
-    dtype and device.
+    The chain of pytorch-kinematics is built from float64 matrices, not from URDF text: its
+    reader rounds offsets to float32, ignores mimic joints and gives continuous joints with an
+    effort limit the range (0, 0). One chain is kept per dtype and device.
     """
 
     def __init__(self, arrays: KinematicArrays) -> None:
         self._arrays = arrays
-        self._chains: dict[tuple[torch.dtype, torch.device], _Chain] = {}
+        self._chains: dict[tuple[torch.dtype, torch.device], tuple[Any, ...]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_arrays": self._arrays, "_chains": {}}
 
     def sphere_centers(self, q: torch.Tensor) -> torch.Tensor:
         """(B, dof) -> (B, S, 3) in the base frame, metres."""
+        import torch
+
         key = (q.dtype, q.device)
         if key not in self._chains:
-            self._chains[key] = _Chain(self._arrays, *key)
-        return self._chains[key](q)
-
-
-class _Chain:
-    def __init__(self, arrays: KinematicArrays, dtype: torch.dtype, device: torch.device) -> None:
-        import torch
-
-        if dtype not in (torch.float32, torch.float64):
-            raise RobotError(f"q has dtype {dtype}; valid: torch.float32, torch.float64")
-
-        def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.tensor(values, device=device).to(
-                dtype if values.dtype.kind == "f" else torch.int64
-            )
-
-        chain = _build_chain(arrays, dtype, device)
-        names = chain.get_joint_parameter_names()
-        order = np.array([int(name[1:]) for name in names])
-        self._chain = chain
-        self._q_index = tensor(arrays.q_index[order])
-        self._q_mult = tensor(arrays.q_mult[order])
-        self._q_offset = tensor(arrays.q_offset[order])
-        placed = [chain.frame_to_idx[f"f{f}"] for f in arrays.sphere_frame]
-        self._frame = torch.tensor(placed, device=device)
-        self._center = tensor(arrays.sphere_center)
-
-    def __call__(self, q: torch.Tensor) -> torch.Tensor:
-        import torch
-
-        joints = q[:, self._q_index] * self._q_mult + self._q_offset
+            self._chains[key] = _torch_chain(self._arrays, *key)
+        chain, q_index, q_mult, q_offset, frame, center = self._chains[key]
+        joints = q[:, q_index] * q_mult + q_offset
         # The chain's own backward is analytic and wrong when differentiated again;
         # the plain graph is right at every order.
-        poses = self._chain.forward_kinematics_tensor(joints, analytical_grad=False)[self._frame]
-        rotated = torch.einsum("sbij,sj->bsi", poses[..., :3, :3], self._center)
+        poses = chain.forward_kinematics_tensor(joints, analytical_grad=False)[frame]
+        rotated = torch.einsum("sbij,sj->bsi", poses[..., :3, :3], center)
         return rotated + poses[..., :3, 3].transpose(0, 1)
 
 
-def _build_chain(arrays: KinematicArrays, dtype: torch.dtype, device: torch.device) -> Any:
-    """The frames as a pytorch-kinematics chain; joint and frame f are "j<f>", "f<f>"."""
+def _torch_chain(
+    arrays: KinematicArrays, dtype: torch.dtype, device: torch.device
+) -> tuple[Any, ...]:
+    """The frames as a pytorch-kinematics chain, joint and frame f being "j<f>", "f<f>"; and, in
+    its order, index, factor and offset of each joint's value; each sphere's frame and centre."""
     import torch
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Joint
     from pytorch_kinematics.frame import Link as ChainLink
     from pytorch_kinematics.transforms import Transform3d
+
+    if dtype not in (torch.float32, torch.float64):
+        raise RobotError(f"q has dtype {dtype}; valid: torch.float32, torch.float64")
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        kind = dtype if values.dtype.kind == "f" else torch.int64
+        return torch.tensor(values, device=device).to(kind)
 
     nodes: list[Frame] = []
     for f in range(len(arrays.parent)):
@@ -393,15 +363,21 @@ def _build_chain(arrays: KinematicArrays, dtype: torch.dtype, device: torch.devi
             matrix[:3, :3], matrix[:3, 3] = arrays.R_off[f], arrays.t_off[f]
             node.joint = Joint(
                 f"j{f}",
-                offset=Transform3d(matrix=torch.tensor(matrix, dtype=dtype, device=device)),
+                offset=Transform3d(matrix=tensor(matrix)),
                 joint_type="prismatic" if arrays.kind[f] == KIND_PRISMATIC else "revolute",
-                axis=torch.tensor(arrays.axis[f], dtype=dtype, device=device),
+                axis=tensor(arrays.axis[f]),
                 dtype=dtype,
                 device=device,
             )
             nodes[arrays.parent[f]].add_child(node)
         nodes.append(node)
-    return Chain(nodes[0], dtype=dtype, device=device)
+    chain = Chain(nodes[0], dtype=dtype, device=device)
+    order = [int(name[1:]) for name in chain.get_joint_parameter_names()]
+    of_joints = (
+        tensor(values[order]) for values in (arrays.q_index, arrays.q_mult, arrays.q_offset)
+    )
+    frame = torch.tensor([chain.frame_to_idx[f"f{f}"] for f in arrays.sphere_frame], device=device)
+    return chain, *of_joints, frame, tensor(arrays.sphere_center)
 
 
 def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
@@ -409,11 +385,6 @@ def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]
 
     A copy even of what is such an array: numba would compile its kernels once more for a
     read-only one. Neither the shape nor that values are finite is looked at.
-
-    Args:
-        values: an array, a tensor, a list or a tuple of real numbers.
-        robot: whose joints the message names.
-        what: for the message, with its article.
 
     Raises:
         RobotError: they are not real numbers, ragged, too large for a float, masked, or a

@@ -250,13 +250,16 @@ def touching_pairs(
     return {(names[a], names[b]) for a, b in arrays.pairs[touching]}
 
 
-def shares_touching(
-    arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"], samples: int = 500, seed: int = 0
-) -> tuple[Float[np.ndarray, "pairs"], Bool[np.ndarray, "samples"]]:
-    """How often each pair's spheres overlap in random configurations, and where any do."""
+def touching_shares(
+    arrays: KinematicArrays, names: Sequence[str], samples: int, seed: int
+) -> dict[frozenset[str], float]:
+    """See :meth:`Robot.touching_shares`."""
     q = random_configurations(arrays, samples, np.random.default_rng(seed))
-    touching = pairs_touching(arrays, q, pairs)
-    return touching.mean(axis=0), np.asarray(touching.any(axis=1))
+    shares = pairs_touching(arrays, q, arrays.pairs).mean(axis=0)
+    return {
+        frozenset((names[a], names[b])): float(share)
+        for (a, b), share in zip(arrays.pairs, shares, strict=True)
+    }
 
 
 def random_configurations(

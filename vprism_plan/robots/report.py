@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
 from vprism_plan.robots.surfaces import (
@@ -102,25 +102,21 @@ class RobotReport:
     def text(self) -> str:
         """Return the links as a table, lengths in millimetres."""
         header = ("link", "spheres", "from", "enclosed", "coverage", "stands out", "mean")
-        rows: list[tuple[str, ...]] = [header]
-        rows += [_row(link) for link in self.links]
-        widths = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
+        rows = [header, *map(_row, self.links)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = []
         for row in rows:
-            cells = [row[0].ljust(widths[0]), row[1].rjust(widths[1]), row[2].ljust(widths[2])]
-            cells.append(row[3].ljust(widths[3]))
-            cells += [row[c].rjust(widths[c]) for c in (4, 5, 6)]
+            cells = (
+                cell.rjust(width) if c in (1, 4, 5, 6) else cell.ljust(width)
+                for c, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
             lines.append("  ".join(cells).rstrip())
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
-        return {
-            **asdict(self),
-            "spheres": self.spheres,
-            "enclosed": self.enclosed,
-            "protrusion": self.protrusion,
-        }
+        derived = {key: getattr(self, key) for key in ("spheres", "enclosed", "protrusion")}
+        return asdict(self) | derived
 
 
 def _row(link: LinkReport) -> tuple[str, ...]:
@@ -146,11 +142,7 @@ def _row(link: LinkReport) -> tuple[str, ...]:
 
 def robot_report(robot: Any) -> RobotReport:
     """See :meth:`Robot.report`."""
-    shaped = (*robot.geometry_as_read, *robot.meshes_as_read)
-    names = [
-        *robot.link_spheres,
-        *(name for name in dict.fromkeys(shaped) if name not in robot.link_spheres),
-    ]
+    names = dict.fromkeys((*robot.link_spheres, *robot.geometry_as_read, *robot.meshes_as_read))
     pairs = sorted((*sorted(pair), why) for pair, why in robot.disabled_pairs.items())
     return RobotReport(
         robot.name,
@@ -161,19 +153,25 @@ def robot_report(robot: Any) -> RobotReport:
     )
 
 
+def _of_link(
+    robot: Any, name: str
+) -> tuple[tuple[PrimitiveGeometry, ...], tuple[MeshFile, ...], np.ndarray]:
+    """Its solids, its meshes and its spheres, as they were read."""
+    solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
+    return solids, meshes, robot.link_spheres.get(name, np.empty((0, 4)))
+
+
 def robot_warnings(robot: Any) -> tuple[str, ...]:
     """See :attr:`Robot.warnings`. Samples, no proof: that takes a second (`Robot.report`)."""
     bare, unread, unchecked = [], [], []
     for name in dict.fromkeys((*robot.geometry_as_read, *robot.meshes_as_read)):
-        solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
-        rows = robot.link_spheres.get(name, np.empty((0, 4)))
+        solids, meshes, rows = _of_link(robot, name)
         if len(rows) == 0:
             unchecked.append(name)
         elif any(mesh.path is None for mesh in meshes):
             unread.append(name)
         elif robot.sphere_sources.get(name) not in {"fitted", "tiled"}:  # those hold their link
-            surface = link_triangles(solids, meshes, _SIDES)
-            points = surface_samples(surface, _QUICK) if len(surface) else np.empty((0, 3))
+            points = surface_samples(link_triangles(solids, meshes, _SIDES), _QUICK)
             stands_out = float(sphere_gap(points, rows).max(initial=0.0))
             if stands_out > _BARE:
                 bare.append(f"{name} by {1000.0 * stands_out:.0f} mm")
@@ -194,11 +192,12 @@ def robot_warnings(robot: Any) -> tuple[str, ...]:
 
 
 def _link_report(robot: Any, name: str) -> LinkReport:
-    solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
-    rows = robot.link_spheres.get(name, np.empty((0, 4)))
+    solids, meshes, rows = _of_link(robot, name)
     missing = tuple(mesh.filename for mesh in meshes if mesh.path is None)
+    kinds = [solid.kind for solid in solids] + ["mesh"] * len(meshes)
+    geometry = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
     source = robot.sphere_sources.get(name, "-")
-    stated = LinkReport(name, len(rows), source, _described(solids, meshes), missing)
+    stated = LinkReport(name, len(rows), source, geometry, missing)
     if (solids or meshes) and len(rows) == 0:
         return replace(stated, enclosed=False, coverage=0.0)
     if missing or not (solids or meshes):
@@ -206,18 +205,13 @@ def _link_report(robot: Any, name: str) -> LinkReport:
     held = [solid for solid in solids if solid.kind == "sphere" and _in_one(solid, rows)]
     rest = [solid for solid in solids if solid not in held]
     surface = link_triangles(rest, meshes, _SIDES)
-    points = np.empty((0, 3))
-    if len(surface):
-        points = surface_samples(surface)
-    gap = sphere_gap(points, rows)
-    proved = len(surface) == 0 or enclosed(surface, rows)
-    in_meshes = link_triangles((), meshes) if meshes else None
-    worst, mean = protrusion(solids, in_meshes, rows)
-    return LinkReport(
-        *(name, len(rows), source, stated.geometry, ()),
-        enclosed=proved,
+    gap = sphere_gap(surface_samples(surface), rows)
+    worst, mean = protrusion(solids, link_triangles((), meshes) if meshes else None, rows)
+    return replace(
+        stated,
+        enclosed=enclosed(surface, rows),
         coverage=float((gap <= 0.0).mean()) if len(gap) else 1.0,
-        bare=max(0.0, float(gap.max())) if len(gap) else 0.0,
+        bare=float(gap.max(initial=0.0)),
         protrusion=worst,
         mean_protrusion=mean,
     )
@@ -226,11 +220,6 @@ def _link_report(robot: Any, name: str) -> LinkReport:
 def _in_one(solid: PrimitiveGeometry, rows: np.ndarray) -> bool:
     away = np.linalg.norm(rows[:, :3] - solid.T_link[:3, 3], axis=1)
     return bool((away + solid.size[0] <= rows[:, 3] * (1.0 + 1e-12)).any())
-
-
-def _described(solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile]) -> str:
-    kinds = [solid.kind for solid in solids] + ["mesh"] * len(meshes)
-    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
 
 
 # Where a triangle's edges are shorter than this and it still is in no single sphere, the
@@ -333,17 +322,9 @@ def _mesh_distance(
     dense = split_triangles(triangles, edge)
     samples = np.concatenate([dense.reshape(-1, 3), dense.mean(axis=1)])
     away = np.asarray(cKDTree(samples).query(points)[0])
-    away[_enclosed_by(triangles, points)] = 0.0
-    return away
-
-
-def _enclosed_by(
-    triangles: Float[np.ndarray, "f 3 3"], points: Float[np.ndarray, "n 3"]
-) -> Bool[np.ndarray, "n"]:
-    """Points in cells that the surface encloses, as the fit sees it."""
+    # Points in cells that the surface encloses, as the fit sees it.
     surface = Surface.of(triangles, math.inf)
     at = np.floor((points - surface.lower) / surface.cell).astype(np.int64)
     there = ((at >= 0) & (at < surface.inner.shape)).all(axis=1)
-    result = np.zeros(len(points), dtype=bool)
-    result[there] = surface.inner[tuple(at[there].T)]
-    return result
+    away[there] *= ~surface.inner[tuple(at[there].T)]
+    return away

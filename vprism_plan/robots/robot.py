@@ -496,12 +496,7 @@ class Robot:
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
         """
-        shares, _ = pairs.shares_touching(self.arrays, self.collision_pairs, samples, seed)
-        names = self.link_names
-        return {
-            frozenset((names[a], names[b])): float(share)
-            for (a, b), share in zip(self.collision_pairs, shares, strict=True)
-        }
+        return pairs.touching_shares(self.arrays, self.link_names, samples, seed)
 
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is

@@ -197,12 +197,12 @@ def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]
     for link, value in table.items():
         try:
             number = float(value)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number):
             raise RobotError(
                 f"{source}: the buffer of link '{link}' is {value!r}; it must be metres"
-            ) from error
-        if not math.isfinite(number):
-            raise RobotError(f"{source}: the buffer of link '{link}' is {value!r}; write metres")
+            )
         if number > 0.0 and len(spheres.get(link, ())):
             padding[str(link)] = number
     return padding

@@ -170,7 +170,7 @@ def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> l
         if found is None:
             low = middle
         else:
-            best, high = [which for which, _ in found], middle
+            best, high = found, middle
     return best
 
 
@@ -183,27 +183,23 @@ def _candidate_cells(depth: Float[np.ndarray, "n"], most: int) -> Int[np.ndarray
     return np.unique(np.concatenate([deepest, spread]))
 
 
-def _greedy_cover(
-    reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int
-) -> list[tuple[int, float]] | None:
-    """Choose spheres until all cells are held: each time the one that holds most new cells.
+def _greedy_cover(reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int) -> list[int] | None:
+    """Choose spheres until all is held: each time the one that holds most of what is new.
 
     Returns:
-        (candidate, radius) with each radius cut to what its new cells need, or None if
-        more than `most` would be needed.
+        Indices, or None if more than `most` would be needed.
     """
     holds = reach <= radius[:, None]
     if not holds.any(axis=0).all():
         return None
     left = np.ones(reach.shape[1], dtype=bool)
     gain = holds.sum(axis=1)
-    chosen: list[tuple[int, float]] = []
+    chosen: list[int] = []
     while left.any():
         if len(chosen) == most:
             return None
-        which = int(np.argmax(gain))
-        new = left & holds[which]
-        chosen.append((which, float(reach[which, new].max())))
+        chosen.append(int(np.argmax(gain)))
+        new = left & holds[chosen[-1]]
         left &= ~new
         gain -= holds[:, new].sum(axis=1)
     return chosen

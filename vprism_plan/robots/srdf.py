@@ -58,10 +58,6 @@ class SemanticModel:
 def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     """Read an SRDF and check every name in it against the URDF.
 
-    Args:
-        path: The SRDF file.
-        model: The robot it belongs to.
-
     Raises:
         RobotError: The file is missing or malformed, or names links or joints the
             robot does not have: a disabled pair with a typing error would

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -80,12 +81,8 @@ class Surface:
         from scipy.spatial.distance import cdist
 
         away = cdist(centres, self.points)
-        return np.asarray(
-            np.maximum(
-                np.maximum(away[:, self.faces[:, 0]], away[:, self.faces[:, 1]]),
-                away[:, self.faces[:, 2]],
-            )
-        )
+        corners = (away[:, corner] for corner in self.faces.T)
+        return np.asarray(functools.reduce(np.maximum, corners))
 
     def signed(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Signed distance, interpolated between cells; negative inside."""
@@ -168,6 +165,8 @@ def surface_samples(
     triangles: Float[np.ndarray, "f 3 3"], count: int = _SAMPLES, seed: int = 0
 ) -> Float[np.ndarray, "n 3"]:
     """Points of a surface: `count` uniform by area, and every corner."""
+    if not len(triangles):
+        return np.empty((0, 3))
     points, _ = drawn_points(triangles, count, seed)
     return np.concatenate([points, triangles.reshape(-1, 3)])
 

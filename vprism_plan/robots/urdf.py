@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,11 @@ class RobotModel:
     root: str
     links: dict[str, Link]
     joints: tuple[Joint, ...]
-    joint_map: dict[str, Joint] = field(repr=False)
+
+    @functools.cached_property
+    def joint_map(self) -> dict[str, Joint]:
+        """The joints by name."""
+        return {joint.name: joint for joint in self.joints}
 
     @property
     def actuated(self) -> tuple[str, ...]:
@@ -97,10 +102,6 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
 
     Only what kinematics and collision need is looked at: visuals, inertias, transmissions and
     simulator tags vary most between files, and a mistake in them must not stop a planner.
-
-    Args:
-        path: The URDF. xacro files have to be expanded first.
-        package_dirs: Where ``package://`` leads to; see :func:`find_mesh`.
 
     Raises:
         RobotError: The file is missing or malformed, or describes something that
@@ -310,9 +311,11 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
             joint mimics what it cannot.
     """
     link_map = {link.name: link for link in links}
-    joint_map = {joint.name: joint for joint in joints}
-    _refuse_duplicates([link.name for link in links], "link", path)
-    _refuse_duplicates([joint.name for joint in joints], "joint", path)
+    for what, named in (("link", links), ("joint", joints)):
+        counts = Counter(item.name for item in named)  # type: ignore[attr-defined]
+        duplicates = sorted(name for name, count in counts.items() if count > 1)
+        if duplicates:
+            raise RobotError(f"{what} names {duplicates} occur more than once in '{path}'")
     if not links:
         raise RobotError(f"'{path}' has no links")
     parent_joint: dict[str, Joint] = {}
@@ -334,42 +337,35 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
         what = f"several roots {roots}" if roots else "no root: its joints form a cycle"
         raise RobotError(f"'{path}' has {what}; a URDF has exactly one link without a parent")
     # Parents first: what hangs below each link, link by link.
-    ordered, queue = list[Joint](), roots
+    ordered: list[Joint] = []
+    queue = list(roots)
     for link in queue:
         below = [joint for joint in joints if joint.parent == link]
         ordered += below
         queue += [joint.child for joint in below]
     if len(ordered) != len(joints):
-        lost = sorted(set(joint_map) - {joint.name for joint in ordered})
+        lost = sorted({joint.name for joint in joints} - {joint.name for joint in ordered})
         raise RobotError(f"joints {lost} in '{path}' form a cycle; a URDF is a tree")
-    _check_mimics(joint_map, path)
-    model = RobotModel(name, roots[0], link_map, tuple(ordered), joint_map)
-    narrowed = joint_map | _narrowed(model, path)
-    return replace(
-        model, joints=tuple(narrowed[joint.name] for joint in ordered), joint_map=narrowed
-    )
+    model = RobotModel(name, roots[0], link_map, tuple(ordered))
+    _check_mimics(model, path)
+    narrowed = _narrowed(model, path)
+    return replace(model, joints=tuple(narrowed.get(joint.name, joint) for joint in ordered))
 
 
-def _refuse_duplicates(names: list[str], what: str, path: Path) -> None:
-    duplicates = sorted(name for name, count in Counter(names).items() if count > 1)
-    if duplicates:
-        raise RobotError(f"{what} names {duplicates} occur more than once in '{path}'")
-
-
-def _check_mimics(joint_map: dict[str, Joint], path: Path) -> None:
-    for joint in joint_map.values():
+def _check_mimics(model: RobotModel, path: Path) -> None:
+    for joint in model.joints:
         seen, current = {joint.name}, joint
         while current.mimic is not None:
             driver = current.mimic[0]
-            if driver not in joint_map or not joint_map[driver].moves:
+            if driver not in model.joint_map or not model.joint_map[driver].moves:
                 raise RobotError(
                     f"joint '{current.name}' in '{path}' mimics '{driver}', which is no moving "
-                    f"joint; valid: {[j.name for j in joint_map.values() if j.moves]}"
+                    f"joint; valid: {[j.name for j in model.joints if j.moves]}"
                 )
             if driver in seen:
                 raise RobotError(f"joint '{joint.name}' in '{path}' mimics itself through {seen}")
             seen.add(driver)
-            current = joint_map[driver]
+            current = model.joint_map[driver]
 
 
 def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
@@ -380,18 +376,20 @@ def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
     joint follows it by a factor that is no integer: that is elsewhere after a whole turn.
     """
     result: dict[str, Joint] = {}
-    for joint in model.joints:
-        if joint.mimic is None or joint.kind == "continuous" or not joint.moves:
-            continue
+    followers = [joint for joint in model.joints if joint.moves and joint.mimic is not None]
+    for joint in sorted(followers, key=lambda joint: joint.kind == "continuous"):
         name, factor, offset = model.resolve_mimic(joint.name)
         driver = result.get(name, model.joint_map[name])
+        turns = driver.kind == "continuous"
+        if joint.kind == "continuous":
+            if turns and abs(factor - round(factor)) > 1e-9:
+                result[name] = replace(driver, kind="revolute")
+            continue
         if factor == 0.0:
-            low, high = (
-                (-math.inf, math.inf) if joint.lower <= offset <= joint.upper else (1.0, 0.0)
-            )
+            within = joint.lower <= offset <= joint.upper
+            low, high = (-math.inf, math.inf) if within else (1.0, 0.0)
         else:
             low, high = sorted((end - offset) / factor for end in (joint.lower, joint.upper))
-        turns = driver.kind == "continuous"
         lower = low if turns else max(driver.lower, low)
         upper = high if turns else min(driver.upper, high)
         if lower > upper + 1e-9:
@@ -401,16 +399,7 @@ def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
                 f"value of '{name}' in [{driver.lower:g}, {driver.upper:g}]; correct the limits, "
                 "the multiplier or the offset"
             )
-        upper = max(lower, upper)
-        if turns and math.isinf(lower):
-            continue
-        kind = "revolute" if turns else driver.kind
-        result[name] = replace(driver, kind=kind, lower=lower, upper=upper)
-    for joint in model.joints:
-        if joint.mimic is None or joint.kind != "continuous":
-            continue
-        name, factor, _ = model.resolve_mimic(joint.name)
-        driver = result.get(name, model.joint_map[name])
-        if driver.kind == "continuous" and abs(factor - round(factor)) > 1e-9:
-            result[name] = replace(driver, kind="revolute")
+        if not (turns and math.isinf(lower)):
+            kind = "revolute" if turns else driver.kind
+            result[name] = replace(driver, kind=kind, lower=lower, upper=max(lower, upper))
     return result
