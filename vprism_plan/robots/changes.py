@@ -165,27 +165,20 @@ def _scaled(
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """Triangles of a mesh, metres."""
-
-    corners: Float[np.ndarray, "f 3 3"]
-
-    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
-        """As of a link's `MeshFile`."""
-        return self.corners
-
-
-@dataclass(frozen=True, eq=False)
 class Held:
-    """Shape of an attached object in its own frame.
+    """Shape of an attached object in its own frame, metres.
 
     Attributes:
-        spheres: rows (x, y, z, radius) that hold it, metres.
-        surface: its mesh, if one was given.
+        spheres: rows (x, y, z, radius) that hold it.
+        surface: the triangles of its mesh, if one was given.
     """
 
     spheres: Float[np.ndarray, "n 4"]
-    surface: Surface | None = None
+    surface: Float[np.ndarray, "f 3 3"] | None = None
+
+    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+        """As of a link's `MeshFile`."""
+        return np.empty((0, 3, 3)) if self.surface is None else self.surface
 
 
 def attached(
@@ -271,7 +264,7 @@ def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
     if max_spheres < 1:
         raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
     triangles = read_triangles(mesh, what)
-    return Held(hold_object(triangles, max_spheres), Surface(triangles))
+    return Held(hold_object(triangles, max_spheres), triangles)
 
 
 def _members(robot: Any, name: str) -> tuple[str, ...]:

@@ -78,32 +78,27 @@ class MeshFile:
             RobotError: See :meth:`require`; or the file cannot be read, holds no triangle
                 with an area, or is too large to be in metres.
         """
-        path = self.require()
-        with reading(path, f"a usable mesh of link '{self.link}'", RobotError, _MOST_BYTES):
-            return self._local(path)
-
-    def _local(self, path: Path) -> Any:
         import trimesh
 
-        what = f"link '{self.link}'"
-        loaded = _loaded(path, what)
-        what = f"{what}, '{path}'"
-        read_triangles(loaded, what, math.inf)  # before merging, which is for finite vertices
-        # Readers keep vertices apart that differ in texture or normal: one point to us.
-        local = trimesh.Trimesh(
-            np.asarray(loaded.vertices, dtype=np.float64) * self.scale, loaded.faces, process=False
-        )
-        local.merge_vertices(merge_tex=True, merge_norm=True)
-        local.apply_transform(self.T_link)
-        if self.scale.prod() < 0.0:
-            local.invert()
-        extent = float(np.ptp(read_triangles(local, what, _LONGEST_LINK), axis=(0, 1)).max())
-        if not local.area > _NO_AREA * extent**2:
-            raise RobotError(
-                f"{what}: the mesh has no area, its triangles are lines or points; give a mesh "
-                "file with a surface, or spheres= for the link"
-            )
-        return local
+        path, what = self.require(), f"link '{self.link}'"
+        with reading(path, f"a usable mesh of {what}", RobotError, _MOST_BYTES):
+            loaded = _loaded(path, what)
+            what = f"{what}, '{path}'"
+            read_triangles(loaded, what, math.inf)  # before merging, which is for finite vertices
+            vertices = np.asarray(loaded.vertices, dtype=np.float64) * self.scale
+            # Readers keep vertices apart that differ in texture or normal: one point to us.
+            local = trimesh.Trimesh(vertices, loaded.faces, process=False)
+            local.merge_vertices(merge_tex=True, merge_norm=True)
+            local.apply_transform(self.T_link)
+            if self.scale.prod() < 0.0:
+                local.invert()
+            extent = float(np.ptp(read_triangles(local, what, _LONGEST_LINK), axis=(0, 1)).max())
+            if not local.area > _NO_AREA * extent**2:
+                raise RobotError(
+                    f"{what}: the mesh has no area, its triangles are lines or points; give a "
+                    "mesh file with a surface, or spheres= for the link"
+                )
+            return local
 
     def triangles(self) -> Float[np.ndarray, "f 3 3"]:
         """Triangles in the link's frame, metres; errors as of :meth:`mesh`."""

@@ -94,7 +94,8 @@ _SMALLEST, _LARGEST = 1e-6, 1e3  # metres of a solid, which is cut into tiles
 # Tables of a robot grow with the square of its links; PR2 has 90.
 _MOST_LINKS = 1000
 _ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
-_SIZES = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",)}
+# Of each solid, the attributes of its size, and how many numbers these hold.
+_SIZES = {"box": (("size",), 3), "cylinder": (("radius", "length"), 2), "sphere": (("radius",), 1)}
 
 
 def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel:
@@ -201,9 +202,8 @@ def _primitive(link: str, shape: ET.Element, T: np.ndarray, path: Path) -> Primi
     kind: Any = shape.tag
     if kind not in _SIZES:
         raise RobotError(f"link '{link}' in '{path}' has a collision shape of Unknown tag: {kind}")
-    words = " ".join(shape.attrib[key] for key in _SIZES[kind])
-    size = tuple(_numbers(words.replace(",", " ") if kind == "box" else words))
-    expected = {"box": 3, "cylinder": 2, "sphere": 1}[kind]
+    keys, expected = _SIZES[kind]
+    size = tuple(_numbers(" ".join(shape.attrib[key].replace(",", " ") for key in keys)))
     if len(size) != expected or not all(_SMALLEST <= v <= _LARGEST for v in size):
         raise RobotError(
             f"link '{link}' in '{path}' has a {kind} of size {size}; "
