@@ -126,17 +126,10 @@ def build_arrays(
     spheres: LinkSpheres,
     base_pose: Float[np.ndarray, "4 4"],
 ) -> tuple[KinematicArrays, dict[str, Attachment]]:
-    """Flatten a robot; pairs of links to test come later.
+    """Flatten a robot into arrays without pairs, and say where each URDF link sits.
 
-    Args:
-        model: The tree.
-        active: Joints of the configuration, in its order.
-        locked: Value of every other actuated joint.
-        spheres: Spheres per link; its keys, in order, are the collision links.
-        base_pose: Pose of the robot's root link in the world.
-
-    Returns:
-        The arrays, and where each URDF link sits.
+    Every other actuated joint than the active ones is locked at its value. The links with
+    spheres are numbered in their order in ``spheres``.
     """
     frames: list[tuple[int, np.ndarray, np.ndarray, int, int, float, float]] = [
         (-1, np.eye(4), np.array([0.0, 0.0, 1.0]), KIND_FIXED, -1, 0.0, 0.0)

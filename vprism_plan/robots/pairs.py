@@ -34,21 +34,19 @@ def choose_pairs(
     stated: Mapping[frozenset[str], str] | None,
     samples: int,
 ) -> tuple[Int[np.ndarray, "pairs 2"], dict[frozenset[str], str], dict[frozenset[str], str]]:
-    """Which pairs of links are tested.
+    """Which pairs of links are tested: all but adjacent, rigid and disabled ones, and those that
+    random configurations show to need no test.
 
     Args:
         model: The tree.
         arrays: The robot.
         chosen: Its spheres.
         stated: The pairs that an SRDF disables; None where there is no SRDF.
-        samples: Random configurations, for pairs that are generated without an SRDF.
+        samples: Random configurations, where there is none.
 
     Returns:
-        (P, 2) indices into the links with spheres, first < second, sorted; all pairs that are
-        not tested, with the reasons; and of these the ones that random configurations showed.
-
-    Raises:
-        RobotError: `samples` is not positive.
+        (P, 2) indices into the links with spheres, first < second, sorted; all other pairs,
+        with the reasons; and of these the ones that random configurations showed.
     """
     names = tuple(chosen.rows)
     everything = list(combinations(range(len(names)), 2))

@@ -235,10 +235,6 @@ def enclosed(triangles: Float[np.ndarray, "f 3 3"], spheres: Float[np.ndarray, "
     A triangle whose corners lie in one sphere lies in it. Others are halved, until all do
     (proved) or a corner lies in none (refuted). A surface that touches the union's edge from
     inside, to within a few thousandths of a millimetre, counts as bare.
-
-    Args:
-        triangles: (f, 3, 3) corners, metres.
-        spheres: (n, 4) rows (x, y, z, radius), same frame.
     """
     waiting = [triangles[i : i + _ROWS] for i in range(0, len(triangles), _ROWS)]
     while waiting:
@@ -273,20 +269,12 @@ def protrusion(
     triangles: Float[np.ndarray, "f 3 3"] | None,
     spheres: Float[np.ndarray, "n 4"],
 ) -> tuple[float, float]:
-    """How far the union of spheres stands out of a link.
+    """How far the union of spheres stands out of a link at most, and on average, metres.
 
     Measured at 200 points of each sphere that lie in no other: their distance to the link, 0
     inside it (an open shell is solid up to its convex hull). To a mesh the distance is taken
     to points of it so dense that it is too large by half a millimetre at most where it is two
     centimetres or more.
-
-    Args:
-        primitives: Solids of the link.
-        triangles: Of its meshes, or None.
-        spheres: (n, 4) rows (x, y, z, radius), link frame, metres.
-
-    Returns:
-        The largest and the mean distance, metres.
     """
     points = _outer_points(spheres)
     if len(points) == 0:

@@ -370,11 +370,8 @@ class Robot:
                 f"expected {self._expected('(')}"
             )
         if not np.isfinite(array).all():
-            bad = {
-                name: float(v)
-                for name, v in zip(self.joint_names, array, strict=True)
-                if not math.isfinite(v)
-            }
+            named = zip(self.joint_names, array.tolist(), strict=True)
+            bad = {name: value for name, value in named if not math.isfinite(value)}
             raise RobotError(f"joint values are not finite: {bad}; give finite numbers")
         return array
 

@@ -85,9 +85,6 @@ def inner_balls(
 
     Returns:
         (n, 4) rows (x, y, z, radius), link frame, metres. Read-only.
-
-    Raises:
-        RobotError: a mesh file is missing or cannot be used.
     """
     exact, parts = [np.empty((0, 4))], [np.empty((0, 4))]
     for solid in solids:

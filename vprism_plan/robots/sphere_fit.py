@@ -117,13 +117,6 @@ def hold_object(
     """As :func:`fit_spheres`, but never more than so many, and no open shell counts as solid.
 
     Figures of how far they stand out are in ``tests/robots/test_attached.py``.
-
-    Args:
-        triangles: (f, 3, 3) corners, metres.
-        max_spheres: At least 1.
-
-    Returns:
-        (n, 4) rows (x, y, z, radius), metres.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64)
     count, tolerance = max_spheres, _CLOSE * _diagonal(corners)

@@ -103,10 +103,10 @@ def link_spheres(
     if rest.rows:
         _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
     everything, sources = known | rest.rows, dict.fromkeys(known, "file") | rest.sources
-    rows = {name: everything[name] for name in model.links if len(everything.get(name, ()))}
-    if not rows:
+    held = {name: everything[name] for name in model.links if len(everything.get(name, ()))}
+    if not held:
         raise RobotError(f"{table.source} gives no link a sphere; a robot needs at least one")
-    return ChosenSpheres(rows, {name: sources[name] for name in rows}, table.padding)
+    return ChosenSpheres(held, {name: sources[name] for name in held}, table.padding)
 
 
 def _has_geometry(model: RobotModel, name: str) -> bool:

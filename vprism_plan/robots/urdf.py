@@ -214,7 +214,12 @@ def _primitive(link: str, shape: ET.Element, T: np.ndarray, path: Path) -> Primi
 
 def _joint(element: ET.Element, path: Path) -> Joint:
     name, kind = _name(element, path), element.get("type", "")
-    parent, child = (_end(element, name, part, path) for part in ("parent", "child"))
+    ends = {}
+    for part in ("parent", "child"):
+        end = element.find(part)
+        ends[part] = "" if end is None else end.get("link", "")
+        if not ends[part]:
+            raise RobotError(f"joint '{name}' in '{path}' names no {part} link")
     if kind not in _ALL_TYPES:
         raise RobotError(f"joint '{name}' in '{path}' has type {kind!r}; valid: {_ALL_TYPES}")
     if kind in ("floating", "planar"):
@@ -231,15 +236,7 @@ def _joint(element: ET.Element, path: Path) -> Joint:
             raise RobotError(f"joint '{name}' in '{path}' has a non-finite mimic factor: {mimic}")
     lower, upper, velocity = _limits(element, name, kind, path)
     axis = _axis(element, name, kind, path) if kind != "fixed" else np.array([1.0, 0.0, 0.0])
-    return Joint(name, kind, parent, child, T, axis, lower, upper, velocity, mimic)
-
-
-def _end(joint: ET.Element, name: str, part: str, path: Path) -> str:
-    element = joint.find(part)
-    link = None if element is None else element.get("link")
-    if not link:
-        raise RobotError(f"joint '{name}' in '{path}' names no {part} link")
-    return link
+    return Joint(name, kind, ends["parent"], ends["child"], T, axis, lower, upper, velocity, mimic)
 
 
 def _axis(joint: ET.Element, name: str, kind: str, path: Path) -> np.ndarray:
@@ -312,7 +309,7 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
     """
     link_map = {link.name: link for link in links}
     for what, named in (("link", links), ("joint", joints)):
-        counts = Counter(item.name for item in named)  # type: ignore[attr-defined]
+        counts = Counter(item.name for item in named)
         duplicates = sorted(name for name, count in counts.items() if count > 1)
         if duplicates:
             raise RobotError(f"{what} names {duplicates} occur more than once in '{path}'")
