@@ -19,6 +19,7 @@ from test_padding import well_formed
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot
 from vprism_plan.robots.pairs import pairs_touching
+from vprism_plan.robots.report import enclosed
 from vprism_plan.robots.sphere_fit import hold_object
 
 seeds = st.integers(0, 2**32 - 1)
@@ -287,6 +288,15 @@ def test_spheres_stay_close_to_a_mesh(name, mean, most):
     out = np.maximum(-trimesh.proximity.signed_distance(mesh, points), 0.0)
     assert out.mean() < mean
     assert out.max() < most
+
+
+def test_spheres_hold_a_scan_of_many_triangles():
+    """Boxes around its triangles stand for them; the proof is of the triangles."""
+    mesh = trimesh.creation.icosphere(6)
+    wavy = mesh.vertices * (0.05, 0.04, 0.12) * (1.0 + 0.1 * np.sin(40.0 * mesh.vertices[:, :1]))
+    spheres = hold_object(wavy[mesh.faces], 20)
+    assert len(spheres) <= 20
+    assert enclosed(wavy[mesh.faces], spheres)
 
 
 def test_a_mesh_can_be_attached_from_memory_and_from_a_file(robots, tmp_path):

@@ -31,6 +31,8 @@ _MOST, _ARM_SIZED = 12, 0.35
 _CENTRES, _MORE_CENTRES = 400, 1000
 # What spheres of an object may stand out by without more of them, as a share of its diagonal.
 _CLOSE = 0.015
+# Where it is of more triangles, as scans are, spheres hold boxes around some of them.
+_MANY = 25_000
 _ROUNDS = 30
 # Relative and absolute (metres): what rounding may take away from a radius.
 _SLACK, _HAIR = 1e-9, 1e-9
@@ -118,23 +120,25 @@ def hold_object(
 
     Figures of how far they stand out are in ``tests/robots/test_attached.py``.
     """
-    corners = np.ascontiguousarray(triangles, dtype=np.float64)
-    count, tolerance = max_spheres, _CLOSE * _diagonal(corners)
+    count, tolerance = max_spheres, _CLOSE * _diagonal(triangles)
     while True:
-        rows = _fit(corners.tobytes(), tolerance, count, strict=True)
+        rows = _fitted(triangles, tolerance, count, strict=True)
         # One sphere around the surface holds what it encloses.
         if len(rows) <= max_spheres or count == 1:
-            return rows[:max_spheres].copy()
+            return rows[:max_spheres]
         count = max(1, count + max_spheres - len(rows))
 
 
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
-def _fit(
-    corners: bytes, tolerance: float, max_spheres: int, strict: bool = False
+def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
+    return _fitted(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance, max_spheres)
+
+
+def _fitted(
+    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int, strict: bool = False
 ) -> Float[np.ndarray, "n 4"]:
-    triangles = np.frombuffer(corners).reshape(-1, 3, 3)
-    surface = Surface.of(triangles if strict else with_hull(triangles), tolerance)
+    surface = Surface.of(triangles, tolerance, _MANY if strict else math.inf)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
     depth = -surface.lattice[tuple(index.T)]

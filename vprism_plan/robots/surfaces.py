@@ -28,7 +28,7 @@ class Surface:
 
     Attributes:
         points: (v, 3) corners, each once.
-        faces: (t, 3) indices into them.
+        faces: (t, 3) indices into them; (t, 8) for boxes around triangles.
         lower: outer corner of the lattice's first cell.
         cell: edge of a cell.
         filled: cells with surface in them or enclosed by such cells.
@@ -38,7 +38,7 @@ class Surface:
     """
 
     points: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "t 3"]
+    faces: Int[np.ndarray, "t corners"]
     lower: Float[np.ndarray, "3"]
     cell: float
     filled: Bool[np.ndarray, "x y z"]
@@ -47,8 +47,11 @@ class Surface:
     lattice: Float[np.ndarray, "x y z"] = field(repr=False)
 
     @classmethod
-    def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> Surface:
-        """Cut a surface so that spheres which stand out by the tolerance can hold its parts."""
+    def of(
+        cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float, most: float = math.inf
+    ) -> Surface:
+        """Cut a surface so that spheres which stand out by the tolerance can hold its parts:
+        triangles, or boxes around them where there would be more than so many."""
         from scipy import ndimage
         from scipy.spatial import cKDTree
 
@@ -57,9 +60,10 @@ class Surface:
         cell = float(np.cbrt((high - low).prod())) / _CELLS
         cell = min(max(cell, longest / _MOST_CELLS), longest / _FEWEST)
         edge = min(_EDGE * cell, max(_FINE * tolerance, _FINEST * cell))
-        points, faces = _merged(split_triangles(triangles, edge))
+        parts = split_triangles(triangles, edge)
         # No path from cell to cell passes between corners so near to each other.
-        small = split_triangles(points[faces], 0.8 * cell)
+        small = split_triangles(parts, 0.8 * cell)
+        points, faces = _merged(parts if len(parts) <= most else _boxes(parts, 0.5 * edge))
         dense, _ = _merged(small)
         lower = low - 1.5 * cell
         touched = np.zeros(tuple(np.ceil((high - low) / cell + 3.0).astype(np.int64)), dtype=bool)
@@ -115,15 +119,27 @@ def with_hull(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "t 3 3
     return np.concatenate([triangles, points[hull.simplices]])
 
 
+def _boxes(triangles: Float[np.ndarray, "t 3 3"], edge: float) -> Float[np.ndarray, "b 8 3"]:
+    """Corners of boxes, each around the triangles whose middles are in one cell of a lattice."""
+    cells = np.floor(triangles.mean(axis=1) / edge).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    order = np.argsort(cell, kind="stable")
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    low = np.minimum.reduceat(triangles.min(axis=1)[order], first)
+    high = np.maximum.reduceat(triangles.max(axis=1)[order], first)
+    corners = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)
+    return np.where(corners, high[:, None], low[:, None])
+
+
 def _merged(
-    triangles: Float[np.ndarray, "t 3 3"],
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
-    """Corners, each once, and the triangles' indices into them."""
-    flat = triangles.reshape(-1, 3)
+    parts: Float[np.ndarray, "t corners 3"],
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t corners"]]:
+    """Corners, each once, and the parts' indices into them."""
+    flat = parts.reshape(-1, 3)
     # As bytes, which sort faster than rows; 0.0 + x turns -0.0 into 0.0.
     keys = np.ascontiguousarray(0.0 + flat).view(np.dtype((np.void, 24))).ravel()
     _, which, faces = np.unique(keys, return_index=True, return_inverse=True)
-    return flat[which], faces.reshape(-1, 3)
+    return flat[which], faces.reshape(parts.shape[:2])
 
 
 def split_triangles(
