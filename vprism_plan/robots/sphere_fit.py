@@ -138,7 +138,7 @@ def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray
 def _fitted(
     triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int, strict: bool = False
 ) -> Float[np.ndarray, "n 4"]:
-    surface = Surface.of(triangles, tolerance, _MANY if strict else math.inf)
+    surface = Surface.of(triangles, tolerance, _MANY if strict else None)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
     depth = -surface.lattice[tuple(index.T)]

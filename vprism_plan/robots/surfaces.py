@@ -48,7 +48,7 @@ class Surface:
 
     @classmethod
     def of(
-        cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float, most: float = math.inf
+        cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float, most: int | None = None
     ) -> Surface:
         """Cut a surface so that spheres which stand out by the tolerance can hold its parts:
         triangles, or boxes around them where there would be more than so many."""
@@ -63,7 +63,8 @@ class Surface:
         parts = split_triangles(triangles, edge)
         # No path from cell to cell passes between corners so near to each other.
         small = split_triangles(parts, 0.8 * cell)
-        points, faces = _merged(parts if len(parts) <= most else _boxes(parts, 0.5 * edge))
+        many = most is not None and len(parts) > most
+        points, faces = _merged(_boxes(parts, 0.5 * edge) if many else parts)
         dense, _ = _merged(small)
         lower = low - 1.5 * cell
         touched = np.zeros(tuple(np.ceil((high - low) / cell + 3.0).astype(np.int64)), dtype=bool)
