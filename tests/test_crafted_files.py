@@ -25,10 +25,10 @@ from vprism_plan.mapping.serialization import content_digest
 from vprism_plan.perception import Observation, load_observation, save_observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.planning import read_trajectory
-from vprism_plan.robots._mesh_files import MeshFile
-from vprism_plan.robots._sphere_files import read_spheres
-from vprism_plan.robots._srdf import load_srdf
-from vprism_plan.robots._urdf import load_model
+from vprism_plan.robots.geometry import MeshFile
+from vprism_plan.robots.sphere_files import read_spheres
+from vprism_plan.robots.srdf import load_srdf
+from vprism_plan.robots.urdf import load_model
 
 SECONDS = 20.0  # of processor time for one small file; the slowest takes about one
 EACH = 25  # random mutations of each kind of file

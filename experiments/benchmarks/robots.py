@@ -42,7 +42,7 @@ def measured(name: str, files) -> tuple[dict, Robot]:
     report = robot.report()
     proved = time.process_time() - clock
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, size=(500, robot.dof))
-    from vprism_plan.robots._matrix import pair_gaps
+    from vprism_plan.robots.pairs import pair_gaps
 
     touching = (pair_gaps(robot.arrays, q, robot.collision_pairs) < 0.0).any(axis=1)
     moving = [link for link in report.links if link.spheres]

@@ -20,7 +20,7 @@ from vprism_plan.collision import CollisionChecker
 from vprism_plan.collision._travel import place_points, sphere_jacobians
 from vprism_plan.planning import plan
 from vprism_plan.robots import Robot
-from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.world.visibility import OCCLUDED, classify_points
 
 __all__ = ["Criteria", "Problem", "find_problems"]

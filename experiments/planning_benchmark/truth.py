@@ -24,7 +24,7 @@ from vprism_plan.collision import CollisionChecker
 from vprism_plan.collision._travel import Edges, edges_of, place_points
 from vprism_plan.perception import Plane
 from vprism_plan.robots import Robot
-from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.world import DistanceField, Grid
 from vprism_plan.world.distance import round_down
 

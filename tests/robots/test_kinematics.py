@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from vprism_plan._kernels import checking
 from vprism_plan.collision._packing import pack_robot
 from vprism_plan.robots import Robot
-from vprism_plan.robots._frames import place_spheres
+from vprism_plan.robots.kinematics import frame_poses, place
 
 PANDA_DH = [
     (0, 0.333, 0),
@@ -36,6 +36,10 @@ UR5E_DH = [
     (0, 0.0996, 0),
 ]
 seeds = st.integers(0, 2**32 - 1)
+
+
+def place_spheres(arrays, q):
+    return place(frame_poses(arrays, q), arrays.sphere_frame, arrays.sphere_center)
 
 
 def kernel_centers(robot: Robot, q: np.ndarray) -> np.ndarray:

@@ -18,8 +18,8 @@ from vprism_plan.collision import CollisionChecker, MeshChecker
 from vprism_plan.collision._packing import pack_robot
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
-from vprism_plan.robots._padding import grown
-from vprism_plan.robots._self_collision import pairs_touching
+from vprism_plan.robots.changes import grown
+from vprism_plan.robots.pairs import pairs_touching
 from vprism_plan.world import Sphere, World, WorldConfig
 
 seeds = st.integers(0, 2**32 - 1)
@@ -126,7 +126,7 @@ def test_scaled_spheres_hold_the_scaled_solids_and_what_they_held_before(robots,
 @given(seed=seeds, scale=st.floats(1.0, 3.0))
 def test_a_scale_above_one_never_uncovers_a_point(seed, scale):
     """Links with elbows, too: each sphere is held by the one it becomes."""
-    from vprism_plan.robots._padding import _scaled
+    from vprism_plan.robots.changes import _scaled
 
     rng = np.random.default_rng(seed)
     centers, radii = rng.normal(size=(6, 3)) * 0.2, rng.uniform(0.005, 0.15, 6)

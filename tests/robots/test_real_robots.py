@@ -8,8 +8,8 @@ from real_robots import ROBOTS, found
 
 import vprism_plan as vp
 from vprism_plan.robots import Robot
-from vprism_plan.robots._sphere_checks import sphere_gap, surface_samples
-from vprism_plan.robots._spheres import link_triangles
+from vprism_plan.robots.report import sphere_gap
+from vprism_plan.robots.surfaces import link_triangles, surface_samples
 
 
 @pytest.fixture(scope="module", params=list(ROBOTS))

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot, SphereFit
-from vprism_plan.robots._mesh_files import find_mesh
-from vprism_plan.robots._sphere_checks import enclosed, sphere_gap
+from vprism_plan.robots.geometry import find_mesh
+from vprism_plan.robots.report import enclosed, sphere_gap
 
 URDF = """<robot name="meshed"><link name="base"/><link name="tip"><collision>
   <origin xyz="0.1 0 0.2" rpy="0.3 -0.4 1.1"/>
@@ -201,7 +201,7 @@ def test_bad_geometry_names_the_element_and_the_remedy(tmp_path, case):
 
 def test_a_pair_that_comes_near_in_a_corner_only_is_not_called_never(write):
     """Two arms that reach each other for a small share of configurations only."""
-    from vprism_plan.robots._matrix import pair_gaps
+    from vprism_plan.robots.pairs import pair_gaps
 
     rod = (
         '<collision><origin xyz="0.3 0 0"/><geometry><sphere radius="0.02"/></geometry></collision>'
@@ -225,8 +225,9 @@ def test_a_pair_that_comes_near_in_a_corner_only_is_not_called_never(write):
 
 
 def test_pair_gaps_agree_with_a_plain_count(robots):
-    from vprism_plan.robots._frames import place_spheres
-    from vprism_plan.robots._matrix import _of_links, pair_gaps
+    from test_kinematics import place_spheres
+
+    from vprism_plan.robots.pairs import _of_links, pair_gaps
 
     robot = robots["panda"]
     q = np.random.default_rng(2).uniform(robot.lower, robot.upper, size=(20, robot.dof))

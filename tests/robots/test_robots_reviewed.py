@@ -9,8 +9,8 @@ from small_urdfs import LIMIT, LINK, TWO, chain, joint
 from vprism_plan.cli import main
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot, SphereFit, read_spheres
-from vprism_plan.robots._mesh_files import find_mesh
-from vprism_plan.robots._sphere_files import _loader
+from vprism_plan.robots.geometry import find_mesh
+from vprism_plan.robots.sphere_files import _loader
 
 BIG = [{"center": [0, 0, 0], "radius": 0.06}]
 SMALL = [{"center": [0, 0, 0], "radius": 0.03}]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vprism_plan.robots import Robot
-from vprism_plan.robots._self_collision import pairs_touching, random_configurations
+from vprism_plan.robots.pairs import pairs_touching, random_configurations
 
 
 class SolidOracle:

@@ -58,7 +58,7 @@ def gap(spheres: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def spheres_of(robot: Robot, link: str) -> np.ndarray:
     """The link's spheres in the link frame: at the zero pose, taken back to the link."""
-    from vprism_plan.robots._frames import place_spheres
+    from test_kinematics import place_spheres
 
     q = robot.neutral
     mine = robot.sphere_links == robot.link_names.index(link)

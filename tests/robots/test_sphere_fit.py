@@ -10,7 +10,7 @@ from oracles.kinematics_oracle import random_pose
 
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import PrimitiveGeometry, SphereFit, fit_spheres
-from vprism_plan.robots._sphere_checks import enclosed, protrusion, sphere_gap
+from vprism_plan.robots.report import enclosed, protrusion, sphere_gap
 
 
 def plate_with_hole():

@@ -24,7 +24,7 @@ from vprism_plan.collision.protocols import BakedWorld, Numbers, RuledWorld, Sph
 from vprism_plan.collision.reports import Contact
 from vprism_plan.collision.risk import RiskEstimate
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 
 class Queries:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from vprism_plan.collision._solids import PlacedSolids
 from vprism_plan.collision.mesh_reports import SEEN
-from vprism_plan.robots._sphere_checks import drawn_points
+from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
 from vprism_plan.world.seen import lost_cones, lost_points, surface_points
 

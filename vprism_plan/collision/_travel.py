@@ -11,9 +11,7 @@ from vprism_plan.collision._packing import reach_table
 from vprism_plan.collision.protocols import Answers, Numbers, SphereRobot
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
-from vprism_plan.robots._arrays import KIND_PRISMATIC
-from vprism_plan.robots._frames import frame_poses
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses, joint_values
 
 AT_MOST = 200_000  # configurations of one query
 
@@ -154,7 +152,7 @@ def place_points(
     frames: Int[np.ndarray, " s"],
     local: Float[np.ndarray, "s 3"],
 ) -> Float[np.ndarray, "n s 3"]:
-    """World positions of points that move with frames, from `robots._frames.frame_poses`."""
+    """World positions of points that move with frames, from `robots.kinematics.frame_poses`."""
     return np.ascontiguousarray(np.einsum("nsij,sj->nsi", R[:, frames], local) + t[:, frames])
 
 

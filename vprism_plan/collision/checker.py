@@ -25,7 +25,7 @@ from vprism_plan.collision.protocols import (
 )
 from vprism_plan.collision.reports import MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling

@@ -14,7 +14,7 @@ from vprism_plan.collision.protocols import Numbers
 from vprism_plan.collision.reports import Contact
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
 # Grid steps that the field may refuse beyond a surface: its interpolation gives up less than

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Int
 from vprism_plan.collision._travel import edges_of, place_points
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._frames import frame_poses
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import frame_poses, joint_values
 
 _POINTS = 64  # per sphere and waypoint
 _MAX_CELLS = 200_000_000

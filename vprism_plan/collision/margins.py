@@ -23,8 +23,7 @@ from vprism_plan.collision.path_margins import (
     min_clearance,
 )
 from vprism_plan.collision.protocols import Numbers
-from vprism_plan.robots._frames import frame_poses
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import frame_poses, joint_values
 
 __all__ = [
     "BodyMargin",

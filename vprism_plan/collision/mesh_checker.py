@@ -28,7 +28,7 @@ from vprism_plan.collision.protocols import BakedWorld, Numbers
 from vprism_plan.collision.reports import Contact, MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import Robot
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 _MAX_CONFIGURATIONS = 1_000_000
 

@@ -11,7 +11,7 @@ from vprism_plan.collision._travel import checked_tolerance, edges_of, motion_bo
 from vprism_plan.collision.protocols import Numbers
 from vprism_plan.collision.reports import StateReport
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 _BATCH = 64  # configurations asked at once where clearance is too small to step by
 _HALVINGS = 60

@@ -9,8 +9,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.robots._arrays import KIND_PRISMATIC
-from vprism_plan.robots._frames import frame_poses
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses
 
 _DAMPING = 1e-2
 _LARGEST_STEP = 0.5

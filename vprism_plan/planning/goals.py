@@ -17,8 +17,7 @@ from vprism_plan.planning.ompl_adapter import nearest_turns
 from vprism_plan.planning.path import one_line
 from vprism_plan.planning.protocols import CheckerLike, Configuration
 from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
-from vprism_plan.robots._frames import frame_poses
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import frame_poses, joint_values
 
 _APART = 0.05  # solutions nearer to each other in every joint are one
 

@@ -27,7 +27,7 @@ from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.protocols import CheckerLike, Configuration, RobotLike
-from vprism_plan.robots._values import joint_values
+from vprism_plan.robots.kinematics import joint_values
 
 _TURN = 2.0 * math.pi
 

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Robots: URDF in, collision spheres in world coordinates out."""
 
-from vprism_plan.robots._arrays import KinematicArrays
-from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._mesh_files import MeshFile
-from vprism_plan.robots._sphere_files import read_spheres, write_spheres
-from vprism_plan.robots._sphere_fit import SphereFit, fit_spheres
-from vprism_plan.robots._spheres import enclosing_spheres
+from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
+from vprism_plan.robots.kinematics import KinematicArrays
 from vprism_plan.robots.report import LinkReport, RobotReport
 from vprism_plan.robots.robot import Robot
+from vprism_plan.robots.sphere_files import read_spheres, write_spheres
+from vprism_plan.robots.sphere_fit import SphereFit, fit_spheres
+from vprism_plan.robots.spheres import enclosing_spheres
 
 __all__ = [
     "KinematicArrays",

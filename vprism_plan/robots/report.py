@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._mesh_files import MeshFile
-from vprism_plan.robots._sphere_checks import enclosed, protrusion, sphere_gap, surface_samples
-from vprism_plan.robots._spheres import link_triangles
+from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
+from vprism_plan.robots.surfaces import (
+    Surface,
+    halved_triangles,
+    link_triangles,
+    split_triangles,
+    surface_samples,
+    with_hull,
+)
 
 # A prism of so many sides is a cylinder to within a ten-thousandth of its radius.
 _SIDES = 256
@@ -95,25 +102,21 @@ class RobotReport:
     def text(self) -> str:
         """Return the links as a table, lengths in millimetres."""
         header = ("link", "spheres", "from", "enclosed", "coverage", "stands out", "mean")
-        rows: list[tuple[str, ...]] = [header]
-        rows += [_row(link) for link in self.links]
-        widths = [max(len(row[c]) for row in rows) for c in range(len(rows[0]))]
+        rows = [header, *map(_row, self.links)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = []
         for row in rows:
-            cells = [row[0].ljust(widths[0]), row[1].rjust(widths[1]), row[2].ljust(widths[2])]
-            cells.append(row[3].ljust(widths[3]))
-            cells += [row[c].rjust(widths[c]) for c in (4, 5, 6)]
+            cells = (
+                cell.rjust(width) if c in (1, 4, 5, 6) else cell.ljust(width)
+                for c, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
             lines.append("  ".join(cells).rstrip())
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
-        return {
-            **asdict(self),
-            "spheres": self.spheres,
-            "enclosed": self.enclosed,
-            "protrusion": self.protrusion,
-        }
+        derived = {key: getattr(self, key) for key in ("spheres", "enclosed", "protrusion")}
+        return asdict(self) | derived
 
 
 def _row(link: LinkReport) -> tuple[str, ...]:
@@ -139,11 +142,7 @@ def _row(link: LinkReport) -> tuple[str, ...]:
 
 def robot_report(robot: Any) -> RobotReport:
     """See :meth:`Robot.report`."""
-    shaped = (*robot.geometry_as_read, *robot.meshes_as_read)
-    names = [
-        *robot.link_spheres,
-        *(name for name in dict.fromkeys(shaped) if name not in robot.link_spheres),
-    ]
+    names = dict.fromkeys((*robot.link_spheres, *robot.geometry_as_read, *robot.meshes_as_read))
     pairs = sorted((*sorted(pair), why) for pair, why in robot.disabled_pairs.items())
     return RobotReport(
         robot.name,
@@ -154,19 +153,25 @@ def robot_report(robot: Any) -> RobotReport:
     )
 
 
+def _of_link(
+    robot: Any, name: str
+) -> tuple[tuple[PrimitiveGeometry, ...], tuple[MeshFile, ...], np.ndarray]:
+    """Its solids, its meshes and its spheres, as they were read."""
+    solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
+    return solids, meshes, robot.link_spheres.get(name, np.empty((0, 4)))
+
+
 def robot_warnings(robot: Any) -> tuple[str, ...]:
     """See :attr:`Robot.warnings`. Samples, no proof: that takes a second (`Robot.report`)."""
     bare, unread, unchecked = [], [], []
     for name in dict.fromkeys((*robot.geometry_as_read, *robot.meshes_as_read)):
-        solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
-        rows = robot.link_spheres.get(name, np.empty((0, 4)))
+        solids, meshes, rows = _of_link(robot, name)
         if len(rows) == 0:
             unchecked.append(name)
         elif any(mesh.path is None for mesh in meshes):
             unread.append(name)
         elif robot.sphere_sources.get(name) not in {"fitted", "tiled"}:  # those hold their link
-            surface = link_triangles(solids, meshes, _SIDES)
-            points = surface_samples(surface, _QUICK) if len(surface) else np.empty((0, 3))
+            points = surface_samples(link_triangles(solids, meshes, _SIDES), _QUICK)
             stands_out = float(sphere_gap(points, rows).max(initial=0.0))
             if stands_out > _BARE:
                 bare.append(f"{name} by {1000.0 * stands_out:.0f} mm")
@@ -187,11 +192,12 @@ def robot_warnings(robot: Any) -> tuple[str, ...]:
 
 
 def _link_report(robot: Any, name: str) -> LinkReport:
-    solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
-    rows = robot.link_spheres.get(name, np.empty((0, 4)))
+    solids, meshes, rows = _of_link(robot, name)
     missing = tuple(mesh.filename for mesh in meshes if mesh.path is None)
+    kinds = [solid.kind for solid in solids] + ["mesh"] * len(meshes)
+    geometry = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
     source = robot.sphere_sources.get(name, "-")
-    stated = LinkReport(name, len(rows), source, _described(solids, meshes), missing)
+    stated = LinkReport(name, len(rows), source, geometry, missing)
     if (solids or meshes) and len(rows) == 0:
         return replace(stated, enclosed=False, coverage=0.0)
     if missing or not (solids or meshes):
@@ -199,18 +205,13 @@ def _link_report(robot: Any, name: str) -> LinkReport:
     held = [solid for solid in solids if solid.kind == "sphere" and _in_one(solid, rows)]
     rest = [solid for solid in solids if solid not in held]
     surface = link_triangles(rest, meshes, _SIDES)
-    points = np.empty((0, 3))
-    if len(surface):
-        points = surface_samples(surface)
-    gap = sphere_gap(points, rows)
-    proved = len(surface) == 0 or enclosed(surface, rows)
-    in_meshes = link_triangles((), meshes) if meshes else None
-    worst, mean = protrusion(solids, in_meshes, rows)
-    return LinkReport(
-        *(name, len(rows), source, stated.geometry, ()),
-        enclosed=proved,
+    gap = sphere_gap(surface_samples(surface), rows)
+    worst, mean = protrusion(solids, link_triangles((), meshes) if meshes else None, rows)
+    return replace(
+        stated,
+        enclosed=enclosed(surface, rows),
         coverage=float((gap <= 0.0).mean()) if len(gap) else 1.0,
-        bare=max(0.0, float(gap.max())) if len(gap) else 0.0,
+        bare=float(gap.max(initial=0.0)),
         protrusion=worst,
         mean_protrusion=mean,
     )
@@ -221,6 +222,97 @@ def _in_one(solid: PrimitiveGeometry, rows: np.ndarray) -> bool:
     return bool((away + solid.size[0] <= rows[:, 3] * (1.0 + 1e-12)).any())
 
 
-def _described(solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile]) -> str:
-    kinds = [solid.kind for solid in solids] + ["mesh"] * len(meshes)
-    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+# Where a triangle's edges are shorter than this and it still is in no single sphere, the
+# surface counts as bare, metres.
+_FINEST = 2e-6
+_ON_SPHERE = 200
+_ROWS = 20_000
+
+
+def enclosed(triangles: Float[np.ndarray, "f 3 3"], spheres: Float[np.ndarray, "n 4"]) -> bool:
+    """Whether every point of a surface lies in the union of spheres: a proof, no sampling.
+
+    A triangle whose corners lie in one sphere lies in it. Others are halved, until all do
+    (proved) or a corner lies in none (refuted). A surface that touches the union's edge from
+    inside, to within a few thousandths of a millimetre, counts as bare.
+    """
+    waiting = [triangles[i : i + _ROWS] for i in range(0, len(triangles), _ROWS)]
+    while waiting:
+        part = waiting.pop()
+        away = np.linalg.norm(part[:, :, None] - spheres[None, None, :, :3], axis=3)
+        inside = away <= spheres[:, 3]
+        if not inside.any(axis=2).all():
+            return False
+        part = part[~inside.all(axis=1).any(axis=1)]
+        if len(part) == 0:
+            continue
+        edges = np.linalg.norm(np.roll(part, -1, axis=1) - part, axis=2)
+        if float(edges.max(axis=1).min()) < _FINEST:
+            return False
+        halves = halved_triangles(part, edges)
+        waiting += [halves[i : i + _ROWS] for i in range(0, len(halves), _ROWS)]
+    return True
+
+
+def sphere_gap(
+    points: Float[np.ndarray, "n 3"], spheres: Float[np.ndarray, "m 4"]
+) -> Float[np.ndarray, "n"]:
+    """Signed distance of points to the union of spheres, metres: negative inside."""
+    gap = np.full(len(points), math.inf)
+    for *centre, radius in spheres:
+        gap = np.minimum(gap, np.linalg.norm(points - centre, axis=1) - radius)
+    return gap
+
+
+def protrusion(
+    primitives: Sequence[PrimitiveGeometry],
+    triangles: Float[np.ndarray, "f 3 3"] | None,
+    spheres: Float[np.ndarray, "n 4"],
+) -> tuple[float, float]:
+    """How far the union of spheres stands out of a link at most, and on average, metres.
+
+    Measured at 200 points of each sphere that lie in no other: their distance to the link, 0
+    inside it (an open shell is solid up to its convex hull). To a mesh the distance is taken
+    to points of it so dense that it is too large by half a millimetre at most where it is two
+    centimetres or more.
+    """
+    points = _outer_points(spheres)
+    if len(points) == 0:
+        return 0.0, 0.0
+    away = np.full(len(points), math.inf)
+    for solid in primitives:
+        away = np.minimum(away, solid.signed_distance(points))
+    if triangles is not None:
+        away = np.minimum(away, _mesh_distance(triangles, points))
+    away = np.maximum(away, 0.0)
+    return float(away.max()), float(away.mean())
+
+
+def _outer_points(spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
+    """Points of the union's surface."""
+    i = np.arange(_ON_SPHERE) + 0.5
+    height, turn = 1.0 - 2.0 * i / _ON_SPHERE, math.pi * (1.0 + math.sqrt(5.0)) * i
+    rim = np.sqrt(1.0 - height**2)
+    unit = np.stack([rim * np.cos(turn), rim * np.sin(turn), height], axis=1)
+    points = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
+    return points[sphere_gap(points, spheres) > -1e-9]
+
+
+def _mesh_distance(
+    triangles: Float[np.ndarray, "f 3 3"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """Distance to a surface, 0 where the surface encloses the point."""
+    from scipy.spatial import cKDTree
+
+    triangles = with_hull(triangles)
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    edge = max(0.003, float((high - low).max()) / 60.0)
+    dense = split_triangles(triangles, edge)
+    samples = np.concatenate([dense.reshape(-1, 3), dense.mean(axis=1)])
+    away = np.asarray(cKDTree(samples).query(points)[0])
+    # Points in cells that the surface encloses, as the fit sees it.
+    surface = Surface.of(triangles, math.inf)
+    at = np.floor((points - surface.lower) / surface.cell).astype(np.int64)
+    there = ((at >= 0) & (at < surface.inner.shape)).all(axis=1)
+    away[there] *= ~surface.inner[tuple(at[there].T)]
+    return away

@@ -18,25 +18,26 @@ from numpy.typing import ArrayLike
 
 from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import _attached, _frames, _inner_balls, _padding
-from vprism_plan.robots._arrays import KinematicArrays
-from vprism_plan.robots._build import Request, robot_fields
-from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._inner_balls import SolidBalls
-from vprism_plan.robots._matrix import (
-    RIGID,
-    SAMPLES,
-    shares_touching,
-    srdf_text,
-    write_srdf_text,
+from vprism_plan.robots import changes, pairs, solid_balls
+from vprism_plan.robots.changes import Held
+from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
+from vprism_plan.robots.kinematics import (
+    Attachment,
+    KinematicArrays,
+    TorchKinematics,
+    build_arrays,
+    frame_poses,
+    joint_values,
+    reach_bound,
+    rigid_pose,
 )
-from vprism_plan.robots._mesh_files import MeshFile, PackageDirs
-from vprism_plan.robots._setup import rigid_pose
-from vprism_plan.robots._sphere_files import write_spheres
-from vprism_plan.robots._sphere_fit import SphereFit
-from vprism_plan.robots._torch_kinematics import TorchKinematics
-from vprism_plan.robots._values import joint_values
 from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
+from vprism_plan.robots.solid_balls import SolidBalls
+from vprism_plan.robots.sphere_files import write_spheres
+from vprism_plan.robots.sphere_fit import SphereFit
+from vprism_plan.robots.spheres import link_spheres
+from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, lock_values, write_srdf
+from vprism_plan.robots.urdf import load_model
 
 if TYPE_CHECKING:
     import torch
@@ -69,8 +70,6 @@ class Robot:
             without spheres) and "Rigid" for links that no joint moves against each other;
             "Always" and "Never" of random configurations; or what :meth:`attach` was told.
         arrays: The flat form that compiled kernels read.
-        links_with_meshes: Links whose collision geometry has meshes: what ``geometry``
-            holds of them is not the whole link.
         meshes: Link name -> its collision meshes, read when they are asked for; scaled as
             the robot is, without its padding, by which nothing grows a mesh.
         link_spheres: Link name -> (n, 4) rows (x, y, z, radius) in the link's frame: the
@@ -95,9 +94,8 @@ class Robot:
     groups: dict[str, tuple[str, ...]]
     disabled_pairs: dict[frozenset[str], str]
     arrays: KinematicArrays
-    _links: dict[str, _frames.Attachment] = field(repr=False)
+    _links: dict[str, Attachment] = field(repr=False)
     _torch: TorchKinematics = field(repr=False)
-    links_with_meshes: tuple[str, ...] = ()
     meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     link_spheres: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     sphere_sources: dict[str, str] = field(default_factory=dict, repr=False)
@@ -110,7 +108,7 @@ class Robot:
     # Link -> metres that the file of its spheres wants it to grow by; in `arrays` already.
     _file_padding: dict[str, float] = field(default_factory=dict, repr=False)
     attached: dict[str, str] = field(default_factory=dict)
-    held: dict[str, _attached.Held] = field(default_factory=dict, repr=False)
+    held: dict[str, Held] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         make_read_only(self.__dict__)
@@ -132,7 +130,7 @@ class Robot:
         group: str | None = None,
         package_dirs: PackageDirs = None,
         fit: SphereFit | None = None,
-        matrix_samples: int = SAMPLES,
+        matrix_samples: int = pairs.SAMPLES,
     ) -> Robot:
         """Read a robot.
 
@@ -165,27 +163,57 @@ class Robot:
             RobotError: Something above is malformed or does not fit together; the
                 message names it.
         """
-        fields, padding = robot_fields(
-            Request(
-                Path(path),
-                srdf,
-                spheres,
-                base_pose,
-                joints,
-                group,
-                locked or {},
-                package_dirs,
-                fit or SphereFit(),
-                matrix_samples,
-            )
+        path = Path(path)
+        model = load_model(path, package_dirs)
+        beside = path.with_suffix(".srdf")
+        if srdf is None and beside.is_file():
+            srdf = beside
+        semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
+        active = choose_joints(model, semantics, joints, group)
+        fixed_values = lock_values(model, semantics, active, locked or {})
+        base = rigid_pose(np.eye(4) if base_pose is None else base_pose)
+        chosen = link_spheres(model, path, spheres, fit or SphereFit())
+        arrays, links = build_arrays(model, active, fixed_values, chosen.rows, base)
+        stated = None if srdf is None else semantics.disabled
+        tested, disabled, sampled = pairs.choose_pairs(
+            model, arrays, chosen, stated, matrix_samples
         )
-        robot = cls(**fields)
-        return robot.with_padding(padding) if padding else robot
+        arrays = dataclasses.replace(arrays, pairs=tested)
+        solids = {n: link.primitives for n, link in model.links.items() if link.primitives}
+        meshes = {n: link.meshes for n, link in model.links.items() if link.meshes}
+        robot = cls(
+            name=model.name,
+            joint_names=active,
+            locked=fixed_values,
+            velocity_limits=np.array([model.joint_map[j].velocity for j in active]),
+            base_pose=base,
+            link_names=tuple(chosen.rows),
+            geometry=solids,
+            named_states=semantics.full_states(active),
+            groups=semantics.group_links,
+            disabled_pairs=disabled,
+            arrays=arrays,
+            _links=links,
+            _torch=TorchKinematics(arrays),
+            meshes=meshes,
+            link_spheres=chosen.rows,
+            sphere_sources=chosen.sources,
+            geometry_as_read=solids,
+            meshes_as_read=meshes,
+            _sampled_pairs={p: pairs.hangs_on(model, fixed_values, p) for p in sampled},
+            _file_padding=chosen.padding,
+        )
+        return robot.with_padding(chosen.padding) if chosen.padding else robot
 
     @property
     def dof(self) -> int:
         """Number of joints in a configuration."""
         return len(self.joint_names)
+
+    @property
+    def links_with_meshes(self) -> tuple[str, ...]:
+        """Links with collision meshes: what ``geometry`` holds of them is not the whole link."""
+        return tuple(self.meshes_as_read)
 
     @property
     def lower(self) -> Float[np.ndarray, "dof"]:
@@ -232,7 +260,7 @@ class Robot:
     @functools.cached_property
     def reach(self) -> float:
         """Upper bound on how far any sphere gets from the root link's origin, metres."""
-        return _frames.reach_bound(self.arrays)
+        return reach_bound(self.arrays)
 
     def links_of(self, name: str) -> tuple[str, ...]:
         """The links with collision spheres that a name stands for.
@@ -300,7 +328,7 @@ class Robot:
         Returns:
             Link name -> (4, 4).
         """
-        R, t = _frames.frame_poses(self.arrays, self.check_configuration(q)[None])
+        R, t = frame_poses(self.arrays, self.check_configuration(q)[None])
         poses = {}
         for link, sits in self._links.items():
             frame = np.eye(4)
@@ -321,7 +349,7 @@ class Robot:
         Raises:
             RobotError: See :meth:`check_configuration`.
         """
-        return _inner_balls.solid_balls(self, q)
+        return solid_balls.solid_balls(self, q)
 
     def random_configuration(self, rng: np.random.Generator) -> Float[np.ndarray, "dof"]:
         """A uniform configuration within the limits."""
@@ -342,11 +370,8 @@ class Robot:
                 f"expected {self._expected('(')}"
             )
         if not np.isfinite(array).all():
-            bad = {
-                name: float(v)
-                for name, v in zip(self.joint_names, array, strict=True)
-                if not math.isfinite(v)
-            }
+            named = zip(self.joint_names, array.tolist(), strict=True)
+            bad = {name: value for name, value in named if not math.isfinite(value)}
             raise RobotError(f"joint values are not finite: {bad}; give finite numbers")
         return array
 
@@ -400,7 +425,7 @@ class Robot:
         Raises:
             RobotError: An unknown link or group, or a value that is not allowed for it.
         """
-        return _padding.padded(self, padding, scale)
+        return changes.padded(self, padding, scale)
 
     def attach(
         self,
@@ -426,7 +451,7 @@ class Robot:
             mesh: Instead of spheres: a ``trimesh.Trimesh`` or a mesh file, metres, in the
                 object's frame. It is held by at most ``max_spheres`` spheres, its inside
                 included if it is closed. Around a box of 6 x 6 x 12 cm, 32 spheres protrude
-                by 7 mm on average and 12 mm at most; around plates and rings by up to 3 cm.
+                by 5 mm on average and 11 mm at most; around plates and rings by up to 3 cm.
             pose: (4, 4) pose of the object's frame in the frame of ``link``; None: the same.
             touch_links: Links, groups or attached objects that it may touch (the fingers).
             max_spheres: For ``mesh``.
@@ -434,8 +459,7 @@ class Robot:
         Raises:
             RobotError: The name is taken, a link is unknown, or the shape is unusable.
         """
-        held = _attached.held_object(name, spheres, mesh, max_spheres)
-        return _attached.attached(self, name, link, held, pose, touch_links)
+        return changes.attached(self, name, link, spheres, mesh, pose, touch_links, max_spheres)
 
     def detach(self, name: str) -> Robot:
         """The same robot without an attached object.
@@ -443,7 +467,7 @@ class Robot:
         Raises:
             RobotError: Nothing of that name is attached, or something is attached to it.
         """
-        return _attached.detached(self, name)
+        return changes.detached(self, name)
 
     def report(self) -> RobotReport:
         """Compare the spheres with the geometry of the URDF, and list what is not tested.
@@ -470,12 +494,7 @@ class Robot:
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
         """
-        shares, _ = shares_touching(self.arrays, self.collision_pairs, samples, seed)
-        names = self.link_names
-        return {
-            frozenset((names[a], names[b])): float(share)
-            for (a, b), share in zip(self.collision_pairs, shares, strict=True)
-        }
+        return pairs.touching_shares(self.arrays, self.link_names, samples, seed)
 
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is
@@ -498,26 +517,7 @@ class Robot:
         generated "Always" and "Never" pairs that a locked joint moves against each other: an
         SRDF holds for any joints, what was sampled for these values only.
         """
-        states = {
-            name: dict(zip(self.joint_names, map(float, q), strict=True))
-            for name, q in self.named_states.items()
-        }
-        of_urdf = {
-            pair: why
-            for pair, why in self.disabled_pairs.items()
-            if why != RIGID and not pair & set(self.attached)
-        }
-        passing = [p for p in of_urdf if self._sampled_pairs.get(p)]
-        if passing:
-            _logger.warning(
-                "not written to '%s', as they were found for these values of locked joints only "
-                "(%s): %s; to write them, read the robot with all joints in joints=",
-                *(path, self.locked, sorted(map(sorted, passing))),
-            )
-        of_urdf = {pair: why for pair, why in of_urdf.items() if pair not in passing}
-        write_srdf_text(
-            path, srdf_text(self.name, self.joint_names, self.groups, states, self.locked, of_urdf)
-        )
+        write_srdf(path, self)
 
     def _expected(self, opening: str) -> str:
         return f"{opening}{self.dof},) for the joints {list(self.joint_names)}"

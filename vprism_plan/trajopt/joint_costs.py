@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.robots._torch_kinematics import TorchKinematics
+from vprism_plan.robots.kinematics import TorchKinematics
 from vprism_plan.trajopt.cost import TrajectoryCost, at_least, require_dof
 
 

@@ -25,11 +25,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._fit_surface import Surface, with_hull
-from vprism_plan.robots._mesh_spheres import candidate_cells, greedy_cover
+from vprism_plan.robots.surfaces import Surface, with_hull
 
 _MOST, _ARM_SIZED = 12, 0.35
-_CENTRES = 400
+_CENTRES, _MORE_CENTRES = 400, 1000
+# What spheres of an object may stand out by without more of them, as a share of its diagonal.
+_CLOSE = 0.015
+# Where it is of more triangles, as scans are, spheres hold boxes around some of them.
+_MANY = 25_000
 _ROUNDS = 30
 # Relative and absolute (metres): what rounding may take away from a radius.
 _SLACK, _HAIR = 1e-9, 1e-9
@@ -110,18 +113,40 @@ def fit_spheres(
     return _fit(corners.tobytes(), tolerance, max_spheres).copy()
 
 
+def hold_object(
+    triangles: Float[np.ndarray, "f 3 3"], max_spheres: int = 32
+) -> Float[np.ndarray, "n 4"]:
+    """As :func:`fit_spheres`, but never more than so many, and no open shell counts as solid.
+
+    Figures of how far they stand out are in ``tests/robots/test_attached.py``.
+    """
+    count, tolerance = max_spheres, _CLOSE * _diagonal(triangles)
+    while True:
+        rows = _fitted(triangles, tolerance, count, strict=True)
+        # One sphere around the surface holds what it encloses.
+        if len(rows) <= max_spheres or count == 1:
+            return rows[:max_spheres]
+        count = max(1, count + max_spheres - len(rows))
+
+
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
 def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
-    surface = Surface.of(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance)
+    return _fitted(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance, max_spheres)
+
+
+def _fitted(
+    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int, strict: bool = False
+) -> Float[np.ndarray, "n 4"]:
+    surface = Surface.of(triangles, tolerance, _MANY if strict else None)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
     depth = -surface.lattice[tuple(index.T)]
-    chosen = candidate_cells(depth, _CENTRES)
+    chosen = _candidate_cells(depth, _MORE_CENTRES if strict else _CENTRES)
     centres, depth = centres[chosen], depth[chosen]
     reach = surface.reach(centres).astype(np.float32) * np.float32(1.0 + 1e-6)
     # Moving the spheres afterwards gains about a fifth.
-    first = greedy_cover(reach, depth + 1.25 * tolerance, max_spheres)
+    first = _greedy_cover(reach, depth + 1.25 * tolerance, max_spheres)
     count = max_spheres if first is None else len(first)
     while True:
         start = _smallest(reach, depth, count)
@@ -129,7 +154,7 @@ def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray
         if protrusion <= tolerance or count >= max_spheres:
             break
         count = min(max_spheres, count + max(1, count // 4))
-    return _filled_up(surface, spheres)
+    return _filled_up(surface, spheres, max(protrusion, 0.0) if strict else 0.0)
 
 
 def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> list[int]:
@@ -138,12 +163,43 @@ def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> l
     best, low, high = [int(alone.argmin())], 0.0, float(alone.min())
     for _ in range(7):
         middle = 0.5 * (low + high)
-        found = greedy_cover(reach, depth + middle, count)
+        found = _greedy_cover(reach, depth + middle, count)
         if found is None:
             low = middle
         else:
-            best, high = [which for which, _ in found], middle
+            best, high = found, middle
     return best
+
+
+def _candidate_cells(depth: Float[np.ndarray, "n"], most: int) -> Int[np.ndarray, "c"]:
+    """Cells to centre spheres on: the deepest ones and an even selection of the others."""
+    if len(depth) <= most:
+        return np.arange(len(depth))
+    deepest = np.argsort(-depth, kind="stable")[: most // 4]
+    spread = np.linspace(0, len(depth) - 1, most - len(deepest)).astype(np.int64)
+    return np.unique(np.concatenate([deepest, spread]))
+
+
+def _greedy_cover(reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int) -> list[int] | None:
+    """Choose spheres until all is held: each time the one that holds most of what is new.
+
+    Returns:
+        Indices, or None if more than `most` would be needed.
+    """
+    holds = reach <= radius[:, None]
+    if not holds.any(axis=0).all():
+        return None
+    left = np.ones(reach.shape[1], dtype=bool)
+    gain = holds.sum(axis=1)
+    chosen: list[int] = []
+    while left.any():
+        if len(chosen) == most:
+            return None
+        chosen.append(int(np.argmax(gain)))
+        new = left & holds[chosen[-1]]
+        left &= ~new
+        gain -= holds[:, new].sum(axis=1)
+    return chosen
 
 
 def _settled(
@@ -218,8 +274,10 @@ def _tightened(
     return spheres, float((radius + surface.signed(centres))[kept].max())
 
 
-def _filled_up(surface: Surface, spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 4"]:
-    """Add spheres inside until every cell that no surface reaches is held."""
+def _filled_up(
+    surface: Surface, spheres: Float[np.ndarray, "n 4"], room: float
+) -> Float[np.ndarray, "m 4"]:
+    """Add spheres that stand out by `room` until every cell that no surface reaches is held."""
     index = np.argwhere(surface.whole)
     middles = surface.lower + surface.cell * (index + 0.5)
     depth = -surface.lattice[tuple(index.T)]
@@ -231,7 +289,7 @@ def _filled_up(surface: Surface, spheres: Float[np.ndarray, "n 4"]) -> Float[np.
         if not open_cells.any():
             return spheres
         deepest = int(np.argmax(np.where(open_cells, depth, -np.inf)))
-        radius = max(float(depth[deepest]), half)
+        radius = max(float(depth[deepest]) + room, half)
         spheres = np.vstack([spheres, [*middles[deepest], radius * (1.0 + _SLACK)]])
 
 

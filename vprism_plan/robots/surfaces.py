@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A link's surface as spheres are fitted to it: small triangles, and what is inside of them."""
+"""A link's surface: its triangles, small ones and points of them, and what is inside."""
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
 
 # Cells along the edge of a cube as large as a link's box, and along its longest edge.
 _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
@@ -15,6 +19,7 @@ _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
 # smaller: a sphere cannot be finer than what it must hold.
 _EDGE, _FINE, _FINEST = 1.5, 2.0, 0.5
 _NEXT_TO_NONE = 0.15
+_SAMPLES = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +28,7 @@ class Surface:
 
     Attributes:
         points: (v, 3) corners, each once.
-        faces: (t, 3) indices into them.
+        faces: (t, 3) indices into them; (t, 8) for boxes around triangles.
         lower: outer corner of the lattice's first cell.
         cell: edge of a cell.
         filled: cells with surface in them or enclosed by such cells.
@@ -33,7 +38,7 @@ class Surface:
     """
 
     points: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "t 3"]
+    faces: Int[np.ndarray, "t corners"]
     lower: Float[np.ndarray, "3"]
     cell: float
     filled: Bool[np.ndarray, "x y z"]
@@ -42,7 +47,11 @@ class Surface:
     lattice: Float[np.ndarray, "x y z"] = field(repr=False)
 
     @classmethod
-    def of(cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float) -> Surface:
+    def of(
+        cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float, most: int | None = None
+    ) -> Surface:
+        """Cut a surface so that spheres which stand out by the tolerance can hold its parts:
+        triangles, or boxes around them where there would be more than so many."""
         from scipy import ndimage
         from scipy.spatial import cKDTree
 
@@ -51,9 +60,11 @@ class Surface:
         cell = float(np.cbrt((high - low).prod())) / _CELLS
         cell = min(max(cell, longest / _MOST_CELLS), longest / _FEWEST)
         edge = min(_EDGE * cell, max(_FINE * tolerance, _FINEST * cell))
-        points, faces = _merged(split_triangles(triangles, edge))
+        parts = split_triangles(triangles, edge)
         # No path from cell to cell passes between corners so near to each other.
-        small = split_triangles(points[faces], 0.8 * cell)
+        small = split_triangles(parts, 0.8 * cell)
+        many = most is not None and len(parts) > most
+        points, faces = _merged(_boxes(parts, 0.5 * edge) if many else parts)
         dense, _ = _merged(small)
         lower = low - 1.5 * cell
         touched = np.zeros(tuple(np.ceil((high - low) / cell + 3.0).astype(np.int64)), dtype=bool)
@@ -75,12 +86,8 @@ class Surface:
         from scipy.spatial.distance import cdist
 
         away = cdist(centres, self.points)
-        return np.asarray(
-            np.maximum(
-                np.maximum(away[:, self.faces[:, 0]], away[:, self.faces[:, 1]]),
-                away[:, self.faces[:, 2]],
-            )
-        )
+        corners = (away[:, corner] for corner in self.faces.T)
+        return np.asarray(functools.reduce(np.maximum, corners))
 
     def signed(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Signed distance, interpolated between cells; negative inside."""
@@ -113,15 +120,27 @@ def with_hull(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "t 3 3
     return np.concatenate([triangles, points[hull.simplices]])
 
 
+def _boxes(triangles: Float[np.ndarray, "t 3 3"], edge: float) -> Float[np.ndarray, "b 8 3"]:
+    """Corners of boxes, each around the triangles whose middles are in one cell of a lattice."""
+    cells = np.floor(triangles.mean(axis=1) / edge).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    order = np.argsort(cell, kind="stable")
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    low = np.minimum.reduceat(triangles.min(axis=1)[order], first)
+    high = np.maximum.reduceat(triangles.max(axis=1)[order], first)
+    corners = np.array(list(np.ndindex(2, 2, 2)), dtype=bool)
+    return np.where(corners, high[:, None], low[:, None])
+
+
 def _merged(
-    triangles: Float[np.ndarray, "t 3 3"],
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
-    """Corners, each once, and the triangles' indices into them."""
-    flat = triangles.reshape(-1, 3)
+    parts: Float[np.ndarray, "t corners 3"],
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t corners"]]:
+    """Corners, each once, and the parts' indices into them."""
+    flat = parts.reshape(-1, 3)
     # As bytes, which sort faster than rows; 0.0 + x turns -0.0 into 0.0.
     keys = np.ascontiguousarray(0.0 + flat).view(np.dtype((np.void, 24))).ravel()
     _, which, faces = np.unique(keys, return_index=True, return_inverse=True)
-    return flat[which], faces.reshape(-1, 3)
+    return flat[which], faces.reshape(parts.shape[:2])
 
 
 def split_triangles(
@@ -145,3 +164,40 @@ def halved_triangles(
     a, b, c = (triangles[rows, (start + k) % 3] for k in range(3))
     middle = 0.5 * (a + b)
     return np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+
+
+def link_triangles(
+    solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
+) -> Float[np.ndarray, "f 3 3"]:
+    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
+
+    Raises:
+        RobotError: A mesh is missing or cannot be used.
+    """
+    parts = [solid.triangles(sides) for solid in solids] + [mesh.triangles() for mesh in meshes]
+    return np.concatenate([np.empty((0, 3, 3)), *parts])
+
+
+def surface_samples(
+    triangles: Float[np.ndarray, "f 3 3"], count: int = _SAMPLES, seed: int = 0
+) -> Float[np.ndarray, "n 3"]:
+    """Points of a surface: `count` uniform by area, and every corner."""
+    if not len(triangles):
+        return np.empty((0, 3))
+    points, _ = drawn_points(triangles, count, seed)
+    return np.concatenate([points, triangles.reshape(-1, 3)])
+
+
+def drawn_points(
+    triangles: Float[np.ndarray, "f 3 3"], count: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Points of a surface, uniform by area, and the unit normals of their triangles."""
+    rng = np.random.default_rng(seed)
+    edges = triangles[:, 1:] - triangles[:, :1]
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    area = np.linalg.norm(normal, axis=1)
+    which = rng.choice(len(triangles), size=count, p=area / area.sum())
+    share = rng.random((count, 2))
+    share = np.where(share.sum(axis=1, keepdims=True) > 1.0, 1.0 - share, share)
+    points = triangles[which, 0] + np.einsum("nk,nkj->nj", share, edges[which])
+    return points, normal[which] / area[which, None]

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._fit_surface import Surface, split_triangles
-from vprism_plan.robots._geometry import PrimitiveGeometry
+from vprism_plan.robots.geometry import PrimitiveGeometry
+from vprism_plan.robots.surfaces import Surface, split_triangles
 
 # Metres between centres, and by how much balls may fall short of such a point. Together: some
 # thousand balls for an arm, which fall short of its edges by 7 mm at most.
@@ -49,19 +49,15 @@ def solid_balls(robot: Any, q: Any) -> SolidBalls:
     """See :meth:`Robot.solid_balls`."""
     inner, spheres, without = [np.empty((0, 4))], [np.empty((0, 4))], []
     for name, pose in robot.link_poses(q).items():
-        solids = robot.geometry_as_read.get(name, ())
-        meshes = robot.meshes_as_read.get(name, ())
-        bare = robot.link_spheres.get(name)
-        if name in robot.held:
-            bare, surface = robot.held[name].spheres, robot.held[name].surface
-            meshes = () if surface is None else (surface,)
+        solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
+        bare, held = robot.link_spheres.get(name), robot.held.get(name)
+        if held is not None:
+            bare, meshes = held.spheres, () if held.surface is None else (held,)
+        complete = bool(solids or meshes)
         try:
             rows = inner_balls(solids, meshes)
         except RobotError:  # the file of a mesh is missing or broken
-            rows, meshes = inner_balls(solids, ()), ()
-            complete = False
-        else:
-            complete = bool(solids or meshes)
+            rows, complete = inner_balls(solids, ()), False
         inner.append(_placed(rows, pose))
         if bare is not None and not complete:
             spheres.append(_placed(bare, pose))
@@ -89,9 +85,6 @@ def inner_balls(
 
     Returns:
         (n, 4) rows (x, y, z, radius), link frame, metres. Read-only.
-
-    Raises:
-        RobotError: a mesh file is missing or cannot be used.
     """
     exact, parts = [np.empty((0, 4))], [np.empty((0, 4))]
     for solid in solids:

@@ -3,15 +3,23 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from vprism_plan._files import reading
+import numpy as np
+
+from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._model import RobotModel
-from vprism_plan.robots._xml import robot_element
+from vprism_plan.robots.plain_xml import robot_element
+from vprism_plan.robots.urdf import RobotModel
+
+RIGID = "Rigid"  # why a pair is not tested, where no joint moves its links
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -35,20 +43,20 @@ class SemanticModel:
         ranked = sorted(self.states, key=lambda key: key[0] != "ready")
         return next((self.states[k][joint] for k in ranked if joint in self.states[k]), None)
 
-    def merged_states(self) -> dict[str, dict[str, float]]:
-        """State name -> joint values, merged over the groups that share the name."""
+    def full_states(self, joints: Sequence[str]) -> dict[str, np.ndarray]:
+        """States, merged over the groups that share the name, that have all of these joints."""
         merged: dict[str, dict[str, float]] = {}
         for (name, _group), values in self.states.items():
             merged.setdefault(name, {}).update(values)
-        return merged
+        return {
+            name: np.array([values[joint] for joint in joints])
+            for name, values in merged.items()
+            if values.keys() >= set(joints)
+        }
 
 
 def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     """Read an SRDF and check every name in it against the URDF.
-
-    Args:
-        path: The SRDF file.
-        model: The robot it belongs to.
 
     Raises:
         RobotError: The file is missing or malformed, or names links or joints the
@@ -150,3 +158,109 @@ def _known(name: str, valid: object, what: str, path: Path) -> str:
             f"valid: {sorted(valid)}"  # type: ignore[call-overload]
         )
     return name
+
+
+def choose_joints(
+    model: RobotModel,
+    semantics: SemanticModel,
+    joints: Sequence[str] | None,
+    group: str | None = None,
+) -> tuple[str, ...]:
+    """The joints of a configuration: given, of the group, of the group "arm", or else all."""
+    valid = model.actuated
+    if group is not None:
+        if joints is not None:
+            raise RobotError(f"both joints and the group {group!r} are given; give one of them")
+        joints = [name for name in semantics.groups.get(group, ()) if name in valid]
+        if not joints:
+            raise RobotError(
+                f"the SRDF of '{model.name}' has no group {group!r} with joints that move; "
+                f"groups: {sorted(semantics.groups)}"
+            )
+    if joints is None:
+        arm = [name for name in semantics.groups.get("arm", ()) if name in valid]
+        chosen = tuple(arm) or valid
+    elif isinstance(joints, str):
+        raise RobotError(f"joints is the string {joints!r}; give a sequence of joint names")
+    else:
+        chosen = tuple(joints)
+    unknown = [name for name in chosen if name not in valid]
+    if unknown:
+        raise RobotError(f"unknown or non-actuated joints {unknown}; valid: {list(valid)}")
+    if len(set(chosen)) != len(chosen):
+        raise RobotError(f"joints {list(chosen)} names a joint twice")
+    if not chosen:
+        raise RobotError(f"no joint of '{model.name}' moves; a robot needs at least one")
+    return chosen
+
+
+def lock_values(
+    model: RobotModel,
+    semantics: SemanticModel,
+    active: Sequence[str],
+    given: Mapping[str, float],
+) -> dict[str, float]:
+    """The value of every actuated joint that is not in the configuration."""
+    rest = [name for name in model.actuated if name not in active]
+    unknown = sorted(set(given) - set(rest))
+    if unknown:
+        raise RobotError(f"locked names {unknown}; joints that can be locked here: {rest}")
+    values = {}
+    for name in rest:
+        joint = model.joint_map[name]
+        stated = semantics.state_value(name)
+        if name in given:
+            value = float(given[name])
+        elif stated is not None:
+            value = stated
+        else:
+            value = min(max(0.0, joint.lower), joint.upper)
+        within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
+        if not (math.isfinite(value) and within):
+            raise RobotError(
+                f"joint '{name}' is locked at {value}; its limits are "
+                f"[{joint.lower:.6g}, {joint.upper:.6g}]"
+            )
+        values[name] = value
+    return values
+
+
+def write_srdf(path: str | Path, robot: Any) -> None:
+    """See :meth:`Robot.write_srdf`."""
+    disabled = {
+        pair: why
+        for pair, why in robot.disabled_pairs.items()
+        if why != RIGID and not pair & set(robot.attached)
+    }
+    passing = [pair for pair in disabled if robot._sampled_pairs.get(pair)]
+    if passing:
+        _logger.warning(
+            "not written to '%s', as they were found for these values of locked joints only "
+            "(%s): %s; to write them, read the robot with all joints in joints=",
+            *(path, robot.locked, sorted(map(sorted, passing))),
+        )
+    root = ET.Element("robot", {"name": robot.name})
+    of_joints = {"arm": robot.joint_names}
+    states = [
+        ("arm", name, dict(zip(robot.joint_names, q, strict=True)))
+        for name, q in robot.named_states.items()
+    ]
+    if robot.locked:
+        of_joints["locked"] = tuple(robot.locked)
+        states.append(("locked", "locked", robot.locked))
+    groups = [(group, "joint", joints) for group, joints in of_joints.items()]
+    groups += [(g, "link", links) for g, links in robot.groups.items() if g not in of_joints]
+    for group, kind, members in groups:
+        element = ET.SubElement(root, "group", {"name": group})
+        for member in members:
+            ET.SubElement(element, kind, {"name": member})
+    for group, state, values in states:
+        element = ET.SubElement(root, "group_state", {"name": state, "group": group})
+        for joint, value in values.items():
+            ET.SubElement(element, "joint", {"name": joint, "value": repr(float(value))})
+    for pair in sorted(disabled.keys() - set(passing), key=sorted):
+        first, last = sorted(pair)[0], sorted(pair)[-1]
+        ends = {"link1": first, "link2": last, "reason": disabled[pair]}
+        ET.SubElement(root, "disable_collisions", ends)
+    ET.indent(root)
+    write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n")

@@ -156,6 +156,7 @@ def _loader() -> Any:
 
 def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
     entry = kinematics.get("collision_spheres") if isinstance(kinematics, Mapping) else None
+    named = source
     if isinstance(entry, str):
         path = folder / entry
         if not path.is_file():
@@ -163,10 +164,8 @@ def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
                 f"{source} takes its spheres from '{entry}', and there is no file '{path}'; put "
                 "it there, or give that file itself"
             )
-        named = f"'{path}'"
-        spheres = _table(_yaml(path), named, off=True)
-    else:
-        spheres = _table(entry, source, off=True)
+        entry, named = _yaml(path), f"'{path}'"
+    spheres = _table(entry, named, off=True)
     buffer = kinematics.get("collision_sphere_buffer")
     return SphereTable(source, spheres, _padding(buffer, spheres, source), foreign=True)
 
@@ -197,12 +196,12 @@ def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]
     for link, value in table.items():
         try:
             number = float(value)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number):
             raise RobotError(
                 f"{source}: the buffer of link '{link}' is {value!r}; it must be metres"
-            ) from error
-        if not math.isfinite(number):
-            raise RobotError(f"{source}: the buffer of link '{link}' is {value!r}; write metres")
+            )
         if number > 0.0 and len(spheres.get(link, ())):
             padding[str(link)] = number
     return padding

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots._geometry import PrimitiveGeometry
-from vprism_plan.robots._mesh_files import MeshFile
-from vprism_plan.robots._model import RobotModel
-from vprism_plan.robots._sphere_files import LinkSpheres, read_spheres
-from vprism_plan.robots._sphere_fit import SphereFit, fit_spheres
+from vprism_plan.robots.geometry import PrimitiveGeometry
+from vprism_plan.robots.sphere_files import LinkSpheres, read_spheres
+from vprism_plan.robots.sphere_fit import SphereFit, fit_spheres
+from vprism_plan.robots.surfaces import link_triangles
+from vprism_plan.robots.urdf import RobotModel
 
 # Pieces of about this size protrude by about half of it.
 _TILE_EDGE = 0.06
@@ -27,8 +27,6 @@ _MAX_TILES = 64
 # So many tiles are taken as they are; what needs more is fitted, which needs fewer.
 _FEW_TILES = 12
 _logger = logging.getLogger(__name__)
-
-
 FIT = "fit"
 
 
@@ -56,19 +54,18 @@ def link_spheres(
 ) -> ChosenSpheres:
     """Choose and validate the collision spheres of a robot.
 
-    Args:
-        model: The robot.
-        urdf_path: Where it was read from; ``<stem>_spheres.yml`` beside it is used
-            when ``spheres`` is None.
-        spheres: A file or mapping that :func:`read_spheres` understands; None: the file
-            beside the URDF, else from the URDF's own geometry; "fit": from that in any case.
-        fit: How spheres are fitted.
+    The arguments are those of :meth:`Robot.from_urdf`.
 
     Raises:
         RobotError: A sphere is malformed, names an unknown link, or a link with
             collision geometry would be left without any.
     """
-    _check_names(model, fit)
+    named = set(fit.max_spheres) if isinstance(fit.max_spheres, Mapping) else set()
+    if named - model.links.keys():
+        raise RobotError(
+            f"max_spheres names the links {sorted(named - model.links.keys())}, which the robot "
+            f"does not have; links: {list(model.links)}"
+        )
     if spheres is None:
         beside = urdf_path.with_name(f"{urdf_path.stem}_spheres.yml")
         spheres = beside if beside.is_file() else FIT
@@ -105,26 +102,11 @@ def link_spheres(
     rest = _from_geometry(model, bare, fit)
     if rest.rows:
         _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
-    table_rows = known | rest.rows
-    order = [name for name in model.links if len(table_rows.get(name, ()))]
-    if not order:
+    everything, sources = known | rest.rows, dict.fromkeys(known, "file") | rest.sources
+    held = {name: everything[name] for name in model.links if len(everything.get(name, ()))}
+    if not held:
         raise RobotError(f"{table.source} gives no link a sphere; a robot needs at least one")
-    sources = dict.fromkeys(known, "file") | rest.sources
-    return ChosenSpheres(
-        {name: table_rows[name] for name in order},
-        {name: sources[name] for name in order},
-        table.padding,
-    )
-
-
-def _check_names(model: RobotModel, fit: SphereFit) -> None:
-    table = fit.max_spheres
-    unknown = sorted(set(table) - set(model.links)) if isinstance(table, Mapping) else []
-    if unknown:
-        raise RobotError(
-            f"max_spheres names the links {unknown}, which the robot does not have; "
-            f"links: {list(model.links)}"
-        )
+    return ChosenSpheres(held, {name: sources[name] for name in held}, table.padding)
 
 
 def _has_geometry(model: RobotModel, name: str) -> bool:
@@ -154,18 +136,6 @@ def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) ->
         if parts:
             rows[name] = np.vstack(parts)
     return ChosenSpheres(rows, sources)
-
-
-def link_triangles(
-    solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
-) -> Float[np.ndarray, "f 3 3"]:
-    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
-
-    Raises:
-        RobotError: A mesh is missing or cannot be used.
-    """
-    parts = [solid.triangles(sides) for solid in solids] + [mesh.triangles() for mesh in meshes]
-    return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
 def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
@@ -239,10 +209,8 @@ def _tile_disc(radius: float, rings: int, edge: float) -> Float[np.ndarray, "n 3
 def _tile_box(size: Sequence[float]) -> Float[np.ndarray, "n 4"]:
     edges = np.asarray(size)
     edge = min(_TILE_EDGE, float(edges.min()))
-    counts = np.ceil(edges / edge).astype(int)
-    while counts.prod() > _MAX_TILES:
+    while (counts := np.ceil(edges / edge).astype(int)).prod() > _MAX_TILES:
         edge *= 1.1
-        counts = np.ceil(edges / edge).astype(int)
     cell = edges / counts
     axes = [(np.arange(n) + 0.5) * c - 0.5 * e for n, c, e in zip(counts, cell, edges, strict=True)]
     centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,0 +1,319 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot with links made larger or smaller, and with objects that it carries."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import read_triangles
+from vprism_plan.robots.kinematics import (
+    Attachment,
+    KinematicArrays,
+    TorchKinematics,
+    bounding_ball,
+    in_frame,
+    only_links,
+    rigid_pose,
+)
+from vprism_plan.robots.pairs import NEVER, touching_pairs
+from vprism_plan.robots.sphere_fit import hold_object
+
+_logger = logging.getLogger(__name__)
+
+
+def padded(
+    robot: Any, padding: float | Mapping[str, float], scale: float | Mapping[str, float]
+) -> Any:
+    """See :meth:`Robot.with_padding`."""
+    names = robot.link_names
+    pads, scales = _per_link(robot, padding, 0.0, "padding"), _per_link(robot, scale, 1.0, "scale")
+    arrays = grown(robot.arrays, scales, pads)
+    larger = {name for name, factor in zip(names, scales, strict=True) if factor > 1.0}
+    # "Never" was found for links of another size.
+    again = [
+        pair
+        for pair in robot._sampled_pairs
+        if robot.disabled_pairs.get(pair) == NEVER and pair & larger
+    ]
+    added = [sorted(names.index(name) for name in pair) for pair in again]
+    arrays = dataclasses.replace(arrays, pairs=_with_pairs(arrays, added))
+    geometry, meshes = dict(robot.geometry), dict(robot.meshes)
+    for index, name in enumerate(names):
+        T, factor, pad = robot._links[name].T, float(scales[index]), float(pads[index])
+        about = (robot.arrays.link_center[index] - T[:3, 3]) @ T[:3, :3]
+        if name in geometry:
+            geometry[name] = tuple(solid.grown(about, factor, pad) for solid in geometry[name])
+        if name in meshes and factor != 1.0:
+            meshes[name] = tuple(file.scaled(about, factor) for file in meshes[name])
+    before = touching_pairs(robot.arrays, robot.neutral, names)
+    touching = touching_pairs(arrays, robot.neutral, names) - before
+    if touching:
+        _logger.warning("the scale makes links touch in the neutral state: %s", sorted(touching))
+    return dataclasses.replace(
+        robot,
+        arrays=arrays,
+        disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if p not in again},
+        geometry=geometry,
+        meshes=meshes,
+        _torch=TorchKinematics(arrays),
+    )
+
+
+def _with_pairs(
+    arrays: KinematicArrays, added: Sequence[Sequence[int]]
+) -> Int[np.ndarray, "pairs 2"]:
+    """The pairs that are tested, with others added; sorted."""
+    both = np.vstack([arrays.pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
+    return np.ascontiguousarray(both[np.lexsort((both[:, 1], both[:, 0]))])
+
+
+def _per_link(
+    robot: Any, value: float | Mapping[str, float], default: float, what: str
+) -> Float[np.ndarray, "links"]:
+    """One number per link, from one for all or from a table of links and groups.
+
+    A link's own entry outranks that of a group; of several groups the largest value counts.
+    """
+    names = robot.link_names
+    if not isinstance(value, Mapping):
+        return np.full(len(names), _allowed(value, what, "all links"))
+    found: dict[str, float] = {}
+    for name in sorted(value, key=lambda key: key in names):
+        number = _allowed(value[name], what, repr(name))
+        for link in robot.links_of(name):
+            own = name in names or link not in found
+            found[link] = number if own else max(found[link], number)
+    return np.array([found.get(name, default) for name in names], dtype=np.float64)
+
+
+def _allowed(value: float, what: str, whose: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise RobotError(f"{what} of {whose} is {value!r}; it must be a number") from error
+    if what == "padding" and not (math.isfinite(number) and number >= 0.0):
+        raise RobotError(
+            f"padding of {whose} is {value!r}; it must be finite metres, 0 or more (to shrink "
+            "links, use a scale below 1)"
+        )
+    if what == "scale" and not (math.isfinite(number) and number > 0.0):
+        raise RobotError(f"scale of {whose} is {value!r}; it must be finite and above 0")
+    return number
+
+
+def grown(
+    arrays: KinematicArrays,
+    scale: Float[np.ndarray, "links"],
+    padding: Float[np.ndarray, "links"],
+) -> KinematicArrays:
+    """Scale the spheres of each link about the centre of its bounding ball, then pad them.
+
+    What was padding before is scaled like the rest and stays padding, in self-collision up
+    to its old size: the rest of what a scale above 1 makes of it counts as the link's.
+
+    A scale above 1 gives each sphere the smallest ball that holds it and its scaled image:
+    a link with an elbow does not hold itself when it is only blown up from its middle.
+    """
+    centers, radii = arrays.sphere_center.copy(), arrays.sphere_radius.copy()
+    balls = []
+    for link, (factor, pad) in enumerate(zip(scale, padding, strict=True)):
+        rows = slice(int(arrays.link_start[link]), int(arrays.link_start[link + 1]))
+        if factor != 1.0:
+            centers[rows], radii[rows] = _scaled(
+                centers[rows], radii[rows], arrays.link_center[link], float(factor)
+            )
+        radii[rows] += pad
+        order = np.argsort(-radii[rows], kind="stable")
+        centers[rows], radii[rows] = centers[rows][order], radii[rows][order]
+        balls.append(bounding_ball(centers[rows], radii[rows]))
+    return dataclasses.replace(
+        arrays,
+        sphere_center=np.ascontiguousarray(centers),
+        sphere_radius=radii,
+        link_center=np.array([ball[0] for ball in balls]),
+        link_radius=np.array([ball[1] for ball in balls]),
+        link_padding=np.minimum(scale, 1.0) * arrays.link_padding + padding,
+    )
+
+
+def _scaled(
+    centers: Float[np.ndarray, "n 3"],
+    radii: Float[np.ndarray, "n"],
+    about: Float[np.ndarray, "3"],
+    factor: float,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    arm = centers - about
+    image, big = about + factor * arm, factor * radii * (1.0 + 1e-12)
+    if factor <= 1.0:
+        return image, big
+    length = np.linalg.norm(arm, axis=1)
+    # From the near end of the sphere to the far end of its image.
+    both = 0.5 * (factor * length + big - length + radii)
+    way = factor * length + big - both
+    apart = (factor - 1.0) * length + radii > big
+    scaled = np.where(apart, way / np.where(apart, length, 1.0), factor)
+    return about + scaled[:, None] * arm, np.where(apart, both * (1.0 + 1e-12), big)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Shape of an attached object in its own frame, metres.
+
+    Attributes:
+        spheres: rows (x, y, z, radius) that hold it.
+        surface: the triangles of its mesh, if one was given.
+    """
+
+    spheres: Float[np.ndarray, "n 4"]
+    surface: Float[np.ndarray, "f 3 3"] | None = None
+
+    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+        """As of a link's `MeshFile`."""
+        return np.empty((0, 3, 3)) if self.surface is None else self.surface
+
+
+def attached(
+    robot: Any,
+    name: str,
+    link: str,
+    spheres: Any,
+    mesh: Any,
+    pose: Any,
+    touch_links: Sequence[str],
+    max_spheres: int,
+) -> Any:
+    """See :meth:`Robot.attach`."""
+    what = f"attached object {name!r}"
+    held = _held(what, spheres, mesh, max_spheres)
+    if not isinstance(name, str) or not name or name in robot._links or name in robot.groups:
+        raise RobotError(f"{what}: an object needs a name of its own, no link's or group's")
+    if link not in robot._links:
+        raise RobotError(f"{what}: no link {link!r}; links: {sorted(robot._links)}")
+    if isinstance(touch_links, str):
+        raise RobotError(f"{what}: touch_links is the string {touch_links!r}; give a sequence")
+    T = np.eye(4) if pose is None else rigid_pose(pose, f"{what}: pose")
+    carrier = robot._links[link]
+    sits = Attachment(carrier.frame, carrier.T @ T)
+    siblings = [other for other, parent in robot.attached.items() if parent == link]
+    reasons = dict.fromkeys(siblings, "Attached to the same link") | {link: "Attached"}
+    for touched in (member for entry in touch_links for member in _members(robot, entry)):
+        reasons.setdefault(touched, "Touch link")
+    tested = [i for i, other in enumerate(robot.link_names) if other not in reasons]
+    arrays = _with_link(robot.arrays, sits, held.spheres, tested)
+    names = (*robot.link_names, name)
+    touching = [p for p in touching_pairs(arrays, robot.neutral, names) if name in p]
+    if touching:
+        _logger.warning(
+            "%s touches links in the neutral state: %s; if it may, name them in touch_links",
+            what,
+            sorted(touching),
+        )
+    return dataclasses.replace(
+        robot,
+        link_names=names,
+        disabled_pairs=robot.disabled_pairs
+        | {frozenset((name, other)): reason for other, reason in reasons.items()},
+        arrays=arrays,
+        attached=robot.attached | {name: link},
+        held=robot.held | {name: held},
+        _links=robot._links | {name: sits},
+        _torch=TorchKinematics(arrays),
+    )
+
+
+def detached(robot: Any, name: str) -> Any:
+    """See :meth:`Robot.detach`."""
+    if name not in robot.attached:
+        raise RobotError(f"{name!r} is not attached; attached: {sorted(robot.attached)}")
+    carried = [other for other, parent in robot.attached.items() if parent == name]
+    if carried:
+        raise RobotError(f"{name!r} carries {carried}; detach them first")
+    names = tuple(link for link in robot.link_names if link != name)
+    gone = robot.link_names.index(name)
+    pairs = robot.arrays.pairs[(robot.arrays.pairs != gone).all(axis=1)]
+    arrays = dataclasses.replace(
+        only_links(robot.arrays, np.array([robot.link_names.index(link) for link in names])),
+        pairs=np.ascontiguousarray(pairs - (pairs > gone)),
+    )
+    return dataclasses.replace(
+        robot,
+        link_names=names,
+        disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if name not in p},
+        arrays=arrays,
+        attached={other: link for other, link in robot.attached.items() if other != name},
+        held={other: shape for other, shape in robot.held.items() if other != name},
+        _links={link: sits for link, sits in robot._links.items() if link != name},
+        _torch=TorchKinematics(arrays),
+    )
+
+
+def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
+    if (spheres is None) == (mesh is None):
+        raise RobotError(f"{what}: give either spheres or a mesh")
+    if mesh is None:
+        return Held(_sphere_rows(spheres, what))
+    if max_spheres < 1:
+        raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
+    triangles = read_triangles(mesh, what)
+    return Held(hold_object(triangles, max_spheres), triangles)
+
+
+def _members(robot: Any, name: str) -> tuple[str, ...]:
+    """Links of a link or group, with or without spheres."""
+    if name in robot._links:
+        return (name,)
+    return tuple(robot.groups[name] if name in robot.groups else robot.links_of(name))
+
+
+def _with_link(
+    arrays: KinematicArrays,
+    sits: Attachment,
+    rows: Float[np.ndarray, "n 4"],
+    tested: Sequence[int],
+) -> KinematicArrays:
+    """Add a link at the end: spheres in its own frame, to be tested against some links."""
+    local, radii, center, radius = in_frame(sits, rows)
+    index = len(arrays.link_frame)
+    return dataclasses.replace(
+        arrays,
+        sphere_frame=np.append(arrays.sphere_frame, np.full(len(rows), sits.frame)),
+        sphere_center=np.vstack([arrays.sphere_center, local]),
+        sphere_radius=np.append(arrays.sphere_radius, radii),
+        sphere_link=np.append(arrays.sphere_link, np.full(len(rows), index)),
+        link_start=np.append(arrays.link_start, len(arrays.sphere_radius) + len(rows)),
+        link_frame=np.append(arrays.link_frame, sits.frame),
+        link_center=np.vstack([arrays.link_center, center]),
+        link_radius=np.append(arrays.link_radius, radius),
+        link_fixed=np.append(arrays.link_fixed, sits.frame == 0),
+        link_padding=np.append(arrays.link_padding, 0.0),
+        pairs=_with_pairs(arrays, [(other, index) for other in tested]),
+    )
+
+
+def _sphere_rows(spheres: object, what: str) -> Float[np.ndarray, "n 4"]:
+    try:
+        rows = np.array(spheres, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RobotError(
+            f"{what}: spheres are not rows (x, y, z, radius) in metres: {error}"
+        ) from error
+    if rows.ndim != 2 or rows.shape[1] != 4 or len(rows) == 0:
+        raise RobotError(
+            f"{what}: spheres have shape {rows.shape}; give at least one row (x, y, z, radius)"
+        )
+    bad = np.flatnonzero(~(np.isfinite(rows).all(axis=1) & (rows[:, 3] > 0.0)))
+    if len(bad):
+        raise RobotError(
+            f"{what}: sphere {int(bad[0])} is {rows[bad[0]].tolist()}; centre and radius must be "
+            "finite and the radius positive (metres)"
+        )
+    return rows

@@ -1,0 +1,420 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A robot as flat arrays, and where its frames, links and spheres are for a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from vprism_plan._read_only import make_read_only
+from vprism_plan.errors import RobotError
+from vprism_plan.robots.sphere_files import LinkSpheres
+from vprism_plan.robots.urdf import RobotModel
+
+if TYPE_CHECKING:
+    import torch
+
+KIND_FIXED = 0
+KIND_REVOLUTE = 1
+KIND_PRISMATIC = 2
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicArrays:
+    """A kinematic tree as C-contiguous float64/int64 arrays, read-only.
+
+    Frame 0 is the robot's base; every other frame belongs to one moving joint,
+    parents before children. Fixed joints, and joints locked at a value, are
+    merged into the offsets, so a walk over the frames costs one product per
+    moving joint. The pose of frame f in the world is
+
+        T_f = T_parent(f) @ [R_off, t_off] @ motion(axis, value),
+        value = q_mult * q[q_index] + q_offset       (mimic joints),
+
+    with ``T_0 = [base_R, base_t]``. Metres and radians.
+
+    Attributes:
+        base_R: Rotation of the base in the world.
+        base_t: Position of the base in the world, metres.
+        parent: Parent frame, -1 for frame 0.
+        R_off: Joint frame in its parent frame at joint value 0, rotation.
+        t_off: The same, translation in metres.
+        axis: Unit joint axis in the joint frame.
+        kind: 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic.
+        q_index: Index into the configuration, -1 for frame 0.
+        q_mult: Factor on the configuration value (1 unless the joint mimics).
+        q_offset: Offset added to it (0 unless the joint mimics).
+        sphere_frame: Frame each sphere moves with.
+        sphere_center: Centre in that frame, metres.
+        sphere_radius: Radius, metres. Spheres are sorted by (link, radius
+            falling), so the spheres of a link are contiguous.
+        sphere_link: Index into the robot's ``link_names``.
+        link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
+        link_frame: Frame each link moves with.
+        link_center: Centre of a ball that holds all spheres of the link.
+        link_radius: Radius of that ball.
+        link_fixed: True where no joint moves the link.
+        link_padding: Metres of each link's radii that are padding. They count against the
+            world; a pair's gap is that of its spheres plus the padding of both links.
+        pairs: Link pairs (first < second) to test for self-collision.
+        lower: Lower joint limits; -pi for continuous joints.
+        upper: Upper joint limits; +pi for continuous joints.
+        continuous: True where the joint turns without limit.
+    """
+
+    base_R: Float[np.ndarray, "3 3"]  # noqa: N815
+    base_t: Float[np.ndarray, "3"]
+    parent: Int[np.ndarray, "frames"]
+    R_off: Float[np.ndarray, "frames 3 3"]
+    t_off: Float[np.ndarray, "frames 3"]
+    axis: Float[np.ndarray, "frames 3"]
+    kind: Int[np.ndarray, "frames"]
+    q_index: Int[np.ndarray, "frames"]
+    q_mult: Float[np.ndarray, "frames"]
+    q_offset: Float[np.ndarray, "frames"]
+    sphere_frame: Int[np.ndarray, "spheres"]
+    sphere_center: Float[np.ndarray, "spheres 3"]
+    sphere_radius: Float[np.ndarray, "spheres"]
+    sphere_link: Int[np.ndarray, "spheres"]
+    link_start: Int[np.ndarray, "links_plus_one"]
+    link_frame: Int[np.ndarray, "links"]
+    link_center: Float[np.ndarray, "links 3"]
+    link_radius: Float[np.ndarray, "links"]
+    link_fixed: Bool[np.ndarray, "links"]
+    link_padding: Float[np.ndarray, "links"]
+    pairs: Int[np.ndarray, "pairs 2"]
+    lower: Float[np.ndarray, "dof"]
+    upper: Float[np.ndarray, "dof"]
+    continuous: Bool[np.ndarray, "dof"]
+
+    def __post_init__(self) -> None:
+        """Keep users of the robot's limits and radii from changing those of every checker."""
+        make_read_only(self.__dict__)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        make_read_only(state)
+
+
+@dataclass(frozen=True)
+class Attachment:
+    """Where a link sits: constant pose ``T`` in the moving frame ``frame``."""
+
+    frame: int
+    T: np.ndarray
+
+
+def rotation(
+    axis: Float[np.ndarray, "3"], angle: Float[np.ndarray, "*batch"] | np.float64
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation matrices about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    return np.eye(3) + s * K + (1.0 - c) * (K @ K)
+
+
+def build_arrays(
+    model: RobotModel,
+    active: Sequence[str],
+    locked: Mapping[str, float],
+    spheres: LinkSpheres,
+    base_pose: Float[np.ndarray, "4 4"],
+) -> tuple[KinematicArrays, dict[str, Attachment]]:
+    """Flatten a robot into arrays without pairs, and say where each URDF link sits.
+
+    Every other actuated joint than the active ones is locked at its value. The links with
+    spheres are numbered in their order in ``spheres``.
+    """
+    frames: list[tuple[int, np.ndarray, np.ndarray, int, int, float, float]] = [
+        (-1, np.eye(4), np.array([0.0, 0.0, 1.0]), KIND_FIXED, -1, 0.0, 0.0)
+    ]
+    links = {model.root: Attachment(0, np.eye(4))}
+    for joint in model.joints:
+        parent = links[joint.parent]
+        T = parent.T @ joint.T_origin
+        if not joint.moves:
+            links[joint.child] = Attachment(parent.frame, T)
+            continue
+        driver, factor, shift = model.resolve_mimic(joint.name)
+        if driver in active:
+            kind = KIND_PRISMATIC if joint.kind == "prismatic" else KIND_REVOLUTE
+            index = list(active).index(driver)
+            frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
+            links[joint.child] = Attachment(len(frames) - 1, np.eye(4))
+        else:
+            value, motion = np.float64(factor * locked[driver] + shift), np.eye(4)
+            if joint.kind == "prismatic":
+                motion[:3, 3] = value * joint.axis
+            else:
+                motion[:3, :3] = rotation(joint.axis, value)
+            links[joint.child] = Attachment(parent.frame, T @ motion)
+    chosen = [model.joint_map[name] for name in active]
+    offsets = np.array([frame[1] for frame in frames])
+    arrays = KinematicArrays(
+        base_R=_floats(base_pose[:3, :3]),
+        base_t=_floats(base_pose[:3, 3]),
+        parent=_ints([frame[0] for frame in frames]),
+        R_off=_floats(offsets[:, :3, :3]),
+        t_off=_floats(offsets[:, :3, 3]),
+        axis=_floats([frame[2] for frame in frames]),
+        kind=_ints([frame[3] for frame in frames]),
+        q_index=_ints([frame[4] for frame in frames]),
+        q_mult=_floats([frame[5] for frame in frames]),
+        q_offset=_floats([frame[6] for frame in frames]),
+        **_sphere_arrays(spheres, links),
+        pairs=np.empty((0, 2), dtype=np.int64),
+        lower=_floats([joint.lower for joint in chosen]),
+        upper=_floats([joint.upper for joint in chosen]),
+        continuous=np.array([joint.kind == "continuous" for joint in chosen], dtype=bool),
+    )
+    return arrays, links
+
+
+def _floats(values: object) -> np.ndarray:
+    return np.array(values, dtype=np.float64, order="C")
+
+
+def _ints(values: object) -> np.ndarray:
+    return np.array(values, dtype=np.int64, order="C")
+
+
+def in_frame(
+    sits: Attachment, rows: Float[np.ndarray, "n 4"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "3"], float]:
+    """A link's spheres in the frame that it moves with, radius falling, and a ball around them."""
+    rows = rows[np.argsort(-rows[:, 3], kind="stable")]
+    local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
+    return local, rows[:, 3], *bounding_ball(local, rows[:, 3])
+
+
+def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dict[str, np.ndarray]:
+    centers, radii, ball_centers, ball_radii = zip(
+        *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
+    )
+    counts = [len(rows) for rows in radii]
+    link_frame = _ints([links[name].frame for name in spheres])
+    return {
+        "sphere_frame": np.repeat(link_frame, counts),
+        "sphere_center": _floats(np.vstack(centers)),
+        "sphere_radius": _floats(np.concatenate(radii)),
+        "sphere_link": np.repeat(np.arange(len(counts)), counts),
+        "link_start": _ints([0, *np.cumsum(counts)]),
+        "link_frame": link_frame,
+        "link_center": _floats(ball_centers),
+        "link_radius": _floats(ball_radii),
+        "link_fixed": link_frame == 0,
+        "link_padding": np.zeros(len(link_frame)),
+    }
+
+
+def bounding_ball(
+    centers: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """A small ball that holds a set of balls (Badoiu and Clarkson's iteration).
+
+    Returns:
+        Centre, and a radius rounded up so that every ball is held.
+    """
+    center = centers.mean(axis=0)
+    best, radius = center, np.inf
+    for step in range(1, 200):
+        reach = np.linalg.norm(centers - center, axis=1) + radii
+        far = int(np.argmax(reach))
+        if reach[far] < radius:
+            best, radius = center, float(reach[far])
+        direction = centers[far] - center
+        length = float(np.linalg.norm(direction))
+        if length == 0.0:
+            break
+        center = center + direction / length * (reach[far] / (step + 1.0))
+    return best, radius * (1.0 + 1e-12)
+
+
+def frame_poses(
+    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"]
+) -> tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]]:
+    """World poses of all frames for a batch of configurations (radians or metres): rotations
+    and positions."""
+    n, count = len(q), len(arrays.parent)
+    R, t = np.empty((n, count, 3, 3)), np.empty((n, count, 3))
+    R[:, 0], t[:, 0] = arrays.base_R, arrays.base_t
+    for f in range(1, count):
+        p = arrays.parent[f]
+        value = arrays.q_mult[f] * q[:, arrays.q_index[f]] + arrays.q_offset[f]
+        R[:, f] = R[:, p] @ arrays.R_off[f]
+        t[:, f] = t[:, p] + R[:, p] @ arrays.t_off[f]
+        if arrays.kind[f] == KIND_PRISMATIC:
+            t[:, f] += value[:, None] * (R[:, f] @ arrays.axis[f])
+        else:
+            R[:, f] = R[:, f] @ rotation(arrays.axis[f], value)
+    return R, t
+
+
+def place(
+    poses: tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]],
+    frame: Int[np.ndarray, "m"],
+    points: Float[np.ndarray, "m 3"],
+) -> Float[np.ndarray, "n m 3"]:
+    """World positions of points that move with frames, from :func:`frame_poses`."""
+    R, t = poses
+    return np.asarray((R[:, frame] @ points[:, :, None])[..., 0] + t[:, frame])
+
+
+def only_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+    """Spheres of these links only, in this order; all joints, and no pairs."""
+    counts = np.diff(arrays.link_start)[links]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    rows = np.arange(starts[-1]) + np.repeat(arrays.link_start[links] - starts[:-1], counts)
+    of_spheres = ("sphere_frame", "sphere_center", "sphere_radius")
+    of_links = ("link_frame", "link_center", "link_radius", "link_fixed", "link_padding")
+    return replace(
+        arrays,
+        **{name: getattr(arrays, name)[rows] for name in of_spheres},
+        **{name: getattr(arrays, name)[links] for name in of_links},
+        sphere_link=np.repeat(np.arange(len(links)), counts),
+        link_start=starts,
+        pairs=np.empty((0, 2), dtype=np.int64),
+    )
+
+
+def reach_bound(arrays: KinematicArrays) -> float:
+    """No sphere reaches farther from the base origin than this, metres.
+
+    The sum of offsets along each branch, plus the travel of its prismatic joints,
+    plus how far the spheres stand off their frame: the triangle inequality.
+    """
+    reach = np.zeros(len(arrays.parent))
+    for f in range(1, len(reach)):
+        reach[f] = reach[arrays.parent[f]] + np.linalg.norm(arrays.t_off[f])
+        if arrays.kind[f] == KIND_PRISMATIC:
+            ends = np.array([arrays.lower[arrays.q_index[f]], arrays.upper[arrays.q_index[f]]])
+            reach[f] += np.abs(arrays.q_mult[f] * ends + arrays.q_offset[f]).max()
+    outer = np.linalg.norm(arrays.sphere_center, axis=1) + arrays.sphere_radius
+    return float((reach[arrays.sphere_frame] + outer).max())
+
+
+class TorchKinematics:
+    """Sphere centres in the base frame as a function of a torch configuration.
+
+    The chain of pytorch-kinematics is built from float64 matrices, not from URDF text: its
+    reader rounds offsets to float32, ignores mimic joints and gives continuous joints with an
+    effort limit the range (0, 0). One chain is kept per dtype and device.
+    """
+
+    def __init__(self, arrays: KinematicArrays) -> None:
+        self._arrays = arrays
+        self._chains: dict[tuple[torch.dtype, torch.device], tuple[Any, ...]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_arrays": self._arrays, "_chains": {}}
+
+    def sphere_centers(self, q: torch.Tensor) -> torch.Tensor:
+        """(B, dof) -> (B, S, 3) in the base frame, metres."""
+        import torch
+
+        key = (q.dtype, q.device)
+        if key not in self._chains:
+            self._chains[key] = _torch_chain(self._arrays, *key)
+        chain, q_index, q_mult, q_offset, frame, center = self._chains[key]
+        joints = q[:, q_index] * q_mult + q_offset
+        # The chain's own backward is analytic and wrong when differentiated again;
+        # the plain graph is right at every order.
+        poses = chain.forward_kinematics_tensor(joints, analytical_grad=False)[frame]
+        rotated = torch.einsum("sbij,sj->bsi", poses[..., :3, :3], center)
+        return rotated + poses[..., :3, 3].transpose(0, 1)
+
+
+def _torch_chain(
+    arrays: KinematicArrays, dtype: torch.dtype, device: torch.device
+) -> tuple[Any, ...]:
+    """The frames as a pytorch-kinematics chain, joint and frame f being "j<f>", "f<f>"; and, in
+    its order, index, factor and offset of each joint's value; each sphere's frame and centre."""
+    import torch
+    from pytorch_kinematics.chain import Chain
+    from pytorch_kinematics.frame import Frame, Joint
+    from pytorch_kinematics.frame import Link as ChainLink
+    from pytorch_kinematics.transforms import Transform3d
+
+    if dtype not in (torch.float32, torch.float64):
+        raise RobotError(f"q has dtype {dtype}; valid: torch.float32, torch.float64")
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        kind = dtype if values.dtype.kind == "f" else torch.int64
+        return torch.tensor(values, device=device).to(kind)
+
+    nodes: list[Frame] = []
+    for f in range(len(arrays.parent)):
+        node = Frame(f"f{f}", link=ChainLink(f"f{f}"))
+        if f > 0:
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = arrays.R_off[f], arrays.t_off[f]
+            node.joint = Joint(
+                f"j{f}",
+                offset=Transform3d(matrix=tensor(matrix)),
+                joint_type="prismatic" if arrays.kind[f] == KIND_PRISMATIC else "revolute",
+                axis=tensor(arrays.axis[f]),
+                dtype=dtype,
+                device=device,
+            )
+            nodes[arrays.parent[f]].add_child(node)
+        nodes.append(node)
+    chain = Chain(nodes[0], dtype=dtype, device=device)
+    order = [int(name[1:]) for name in chain.get_joint_parameter_names()]
+    of_joints = (
+        tensor(values[order]) for values in (arrays.q_index, arrays.q_mult, arrays.q_offset)
+    )
+    frame = torch.tensor([chain.frame_to_idx[f"f{f}"] for f in arrays.sphere_frame], device=device)
+    return chain, *of_joints, frame, tensor(arrays.sphere_center)
+
+
+def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
+    """Return joint values as a fresh float64 array, C-contiguous and writeable.
+
+    A copy even of what is such an array: numba would compile its kernels once more for a
+    read-only one. Neither the shape nor that values are finite is looked at.
+
+    Raises:
+        RobotError: they are not real numbers, ragged, too large for a float, masked, or a
+            tensor that requires a gradient.
+    """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values.copy(order="C")
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind == "c":
+            raise TypeError("complex numbers")
+        if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+            raise TypeError("some values are masked")
+        return np.array(array, dtype=np.float64, order="C")
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise RobotError(
+            f"{what} cannot be read from {type(values).__name__}: {error}; give "
+            f"real numbers for the {robot.dof} joints {list(robot.joint_names)}"
+        ) from error
+
+
+def rigid_pose(pose: ArrayLike, what: str = "base_pose") -> Float[np.ndarray, "4 4"]:
+    """A copy of a pose, refused unless it is a proper rigid motion."""
+    try:
+        T = np.array(pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise RobotError(f"{what} is not a (4, 4) array: {error}") from error
+    if T.shape != (4, 4):
+        raise RobotError(f"{what} has shape {T.shape}; expected (4, 4)")
+    if not np.isfinite(T).all():
+        raise RobotError(f"{what} holds NaN or infinite values; give a rigid 4x4 pose")
+    R = T[:3, :3]
+    drift = float(np.abs(R @ R.T - np.eye(3)).max())
+    if drift > 1e-6 or np.linalg.det(R) < 0 or not np.array_equal(T[3], [0, 0, 0, 1]):
+        raise RobotError(
+            f"{what} is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
+            f"determinant {np.linalg.det(R):.6g} (expected 1) and last row {T[3].tolist()} "
+            "(expected [0, 0, 0, 1])"
+        )
+    return T

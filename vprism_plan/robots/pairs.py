@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which pairs of links are tested against each other, and why others are not."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from vprism_plan.errors import RobotError
+from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
+from vprism_plan.robots.spheres import ChosenSpheres
+from vprism_plan.robots.srdf import RIGID
+from vprism_plan.robots.urdf import RobotModel
+
+ADJACENT, ALWAYS, NEVER = "Adjacent", "Always", "Never"
+SAMPLES = 10_000
+# "Never" asks for so much room in every sample, metres, and after a search for less.
+ROOM = 0.05
+_CHUNK = 1000
+_STARTS, _SCALES = 8, (0.1, 0.05, 0.03, 0.02, 0.01)
+_FITTED_SAMPLES = 300
+_logger = logging.getLogger(__name__)
+
+
+def choose_pairs(
+    model: RobotModel,
+    arrays: KinematicArrays,
+    chosen: ChosenSpheres,
+    stated: Mapping[frozenset[str], str] | None,
+    samples: int,
+) -> tuple[Int[np.ndarray, "pairs 2"], dict[frozenset[str], str], dict[frozenset[str], str]]:
+    """Which pairs of links are tested: all but adjacent, rigid and disabled ones, and those that
+    random configurations show to need no test.
+
+    Args:
+        model: The tree.
+        arrays: The robot.
+        chosen: Its spheres.
+        stated: The pairs that an SRDF disables; None where there is no SRDF.
+        samples: Random configurations, where there is none.
+
+    Returns:
+        (P, 2) indices into the links with spheres, first < second, sorted; all other pairs,
+        with the reasons; and of these the ones that random configurations showed.
+    """
+    names = tuple(chosen.rows)
+    everything = list(combinations(range(len(names)), 2))
+    built = {
+        frozenset((names[a], names[b])): RIGID
+        for a, b in everything
+        if arrays.link_frame[a] == arrays.link_frame[b]
+    } | dict.fromkeys(_adjacent(model, set(names)), ADJACENT)
+    known = built | dict(stated or {})
+    left = [(a, b) for a, b in everything if frozenset((names[a], names[b])) not in known]
+    pairs = np.array(left, dtype=np.int64).reshape(-1, 2)
+    if stated is not None:
+        sampled = _touching_fits(arrays, pairs, chosen)
+    else:
+        if samples < 1:
+            raise RobotError(f"matrix_samples is {samples}; at least 1 configuration is needed")
+        sampled = sampled_reasons(arrays, pairs, names, samples)
+        always = [tuple(sorted(pair)) for pair, why in sampled.items() if why == ALWAYS]
+        if always:
+            _logger.warning(
+                "not tested for self-collision, their spheres always overlap: %s", always
+            )
+    kept = [frozenset((names[a], names[b])) not in sampled for a, b in pairs]
+    return np.ascontiguousarray(pairs[kept]), known | sampled, sampled
+
+
+def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
+    """Each collision link with its nearest ancestor that is one too."""
+    above = {joint.child: joint.parent for joint in model.joints}
+    pairs = set()
+    for link in bodies:
+        parent = above.get(link)
+        while parent is not None and parent not in bodies:
+            parent = above.get(parent)
+        if parent is not None:
+            pairs.add(frozenset((link, parent)))
+    return pairs
+
+
+def _touching_fits(
+    arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"], chosen: ChosenSpheres
+) -> dict[frozenset[str], str]:
+    """Pairs that an SRDF wants tested, and whose fitted spheres overlap in every pose."""
+    names = tuple(chosen.rows)
+    made = np.array([chosen.sources[name] in ("fitted", "tiled") for name in names])
+    fitted = pairs[made[pairs].any(axis=1)]
+    q = _zero_and_random(arrays, _FITTED_SAMPLES, np.random.default_rng(0))
+    touching = fitted[pairs_touching(arrays, q, fitted).all(axis=0)]
+    if len(touching):
+        _logger.warning(
+            "the SRDF tests pairs whose fitted spheres always overlap; they are not tested: %s; "
+            "a smaller tolerance (fit=) may part them",
+            [(names[a], names[b]) for a, b in touching],
+        )
+    return _named(touching, names, ALWAYS)
+
+
+def hangs_on(model: RobotModel, joints: Collection[str], pair: frozenset[str]) -> bool:
+    """Whether any of these joints, or one that mimics it, moves two links against each other."""
+    above = {joint.child: joint for joint in model.joints}
+    between: set[str] = set()
+    for end in pair:
+        link = end
+        while link in above:
+            between ^= {above[link].name}  # what is above both moves neither against the other
+            link = above[link].parent
+    return any(model.resolve_mimic(name)[0] in joints for name in between)
+
+
+def sampled_reasons(
+    arrays: KinematicArrays,
+    pairs: Int[np.ndarray, "pairs 2"],
+    names: Sequence[str],
+    samples: int,
+) -> dict[frozenset[str], str]:
+    """Pairs that overlap always, and pairs that never come near each other.
+
+    "Always": the spheres overlap at the joints' zero and in every random configuration. The
+    pair does so because of how the links are built, or of how coarse the spheres are;
+    testing it would refuse every pose. "Never": the spheres are 5 cm apart in every one, and
+    stay so when the joints are moved downhill from the nearest. A sample proves neither:
+    a pair that comes near in a corner of the joint space only can be missed, so what is in
+    between, and what was nearer just once, stays tested.
+    """
+    rng = np.random.default_rng(0)
+    q = _zero_and_random(arrays, samples - 1, rng)
+    always, far = np.ones(len(pairs), dtype=bool), np.ones(len(pairs), dtype=bool)
+    nearest = np.full((len(pairs), _STARTS), np.inf)
+    starts = np.zeros((len(pairs), _STARTS, len(arrays.lower)))
+    for begin in range(0, len(q), _CHUNK):
+        part = q[begin : begin + _CHUNK]
+        # What was seen apart once and near once stays tested: nothing more to learn.
+        waiting = np.flatnonzero(always | far)
+        gaps = pair_gaps(arrays, part, pairs[waiting])
+        always[waiting] &= (gaps < 0.0).all(axis=0)
+        far[waiting] &= (gaps > ROOM).all(axis=0)
+        rows = np.argsort(gaps, axis=0, kind="stable")[:_STARTS].T
+        found = np.concatenate([nearest[waiting], gaps.T[np.arange(len(rows))[:, None], rows]], 1)
+        order = np.argsort(found, axis=1, kind="stable")[:, :_STARTS]
+        candidates = np.concatenate([starts[waiting], part[rows]], axis=1)
+        nearest[waiting] = np.take_along_axis(found, order, axis=1)
+        starts[waiting] = np.take_along_axis(candidates, order[:, :, None], axis=1)
+    apart = np.flatnonzero(far)
+    far[apart] = _least_gaps(arrays, starts[apart], pairs[apart], rng) > ROOM
+    return _named(pairs[always], names, ALWAYS) | _named(pairs[far], names, NEVER)
+
+
+def _named(
+    pairs: Int[np.ndarray, "pairs 2"], names: Sequence[str], reason: str
+) -> dict[frozenset[str], str]:
+    return {frozenset((names[a], names[b])): reason for a, b in pairs}
+
+
+def pair_gaps(
+    arrays: KinematicArrays,
+    q: Float[np.ndarray, "n dof"],
+    pairs: Int[np.ndarray, "pairs 2"],
+) -> Float[np.ndarray, "n pairs"]:
+    """Distance between the spheres of two links in each configuration, padding not counted.
+
+    Beyond :data:`ROOM` it is a lower bound: that of the balls around the links' spheres.
+    """
+    poses = frame_poses(arrays, q)
+    spheres = place(poses, arrays.sphere_frame, arrays.sphere_center)
+    balls = place(poses, arrays.link_frame, arrays.link_center)
+    gaps = np.linalg.norm(balls[:, pairs[:, 0]] - balls[:, pairs[:, 1]], axis=2)
+    gaps -= arrays.link_radius[pairs].sum(axis=1)
+    gaps += arrays.link_padding[pairs].sum(axis=1)
+    for k in np.flatnonzero((gaps <= ROOM).any(axis=0)):
+        near = np.flatnonzero(gaps[:, k] <= ROOM)
+        a, b = (slice(arrays.link_start[i], arrays.link_start[i + 1]) for i in pairs[k])
+        apart = np.linalg.norm(spheres[near, a][:, :, None] - spheres[near, b][:, None], axis=3)
+        apart -= arrays.sphere_radius[a, None] + arrays.sphere_radius[b]
+        gaps[near, k] = apart.min(axis=(1, 2)) + arrays.link_padding[pairs[k]].sum()
+    return gaps
+
+
+def _least_gaps(
+    arrays: KinematicArrays,
+    starts: Float[np.ndarray, "pairs starts dof"],
+    pairs: Int[np.ndarray, "pairs 2"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "pairs"]:
+    """The smallest gaps that random steps downhill from these configurations lead to."""
+    span, least = arrays.upper - arrays.lower, np.full(len(pairs), np.inf)
+    both = np.array([[0, 1]])
+    for k, pair in enumerate(pairs):
+        small = _of_links(arrays, pair)
+        # Every start carries the same steps at once; the nearest is where the next begin.
+        best = starts[k, 0]
+        for scale in _SCALES:
+            steps = scale * span * rng.normal(size=(_STARTS * 8, len(span)))
+            around = np.clip(np.vstack([starts[k], best + steps]), arrays.lower, arrays.upper)
+            gaps = pair_gaps(small, around, both)[:, 0]
+            best = around[int(gaps.argmin())]
+            least[k] = min(least[k], float(gaps.min()))
+            if least[k] <= ROOM:
+                break
+    return least
+
+
+def _of_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+    """Only these links, in this order, and the joints that move them; q stays as it was."""
+    frames: set[int] = {0}
+    for link in links:
+        frame = int(arrays.link_frame[link])
+        while frame > 0:
+            frames.add(frame)
+            frame = int(arrays.parent[frame])
+    kept = np.array(sorted(frames))
+    place_of = np.full(len(arrays.parent), -1)
+    place_of[kept] = np.arange(len(kept))
+    small = only_links(arrays, links)
+    return replace(
+        small,
+        parent=np.where(arrays.parent[kept] >= 0, place_of[arrays.parent[kept]], -1),
+        **{
+            name: getattr(arrays, name)[kept]
+            for name in ("R_off", "t_off", "axis", "kind", "q_index", "q_mult", "q_offset")
+        },
+        sphere_frame=place_of[small.sphere_frame],
+        link_frame=place_of[small.link_frame],
+    )
+
+
+def pairs_touching(
+    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"], pairs: Int[np.ndarray, "pairs 2"]
+) -> Bool[np.ndarray, "n pairs"]:
+    """For each configuration and link pair, whether any of their spheres overlap, padding
+    not counted."""
+    return pair_gaps(arrays, q, pairs) < 0.0
+
+
+def touching_pairs(
+    arrays: KinematicArrays, q: Float[np.ndarray, "dof"], names: Sequence[str]
+) -> set[tuple[str, str]]:
+    """Names of the tested pairs whose spheres overlap at one configuration."""
+    touching = pairs_touching(arrays, q[None], arrays.pairs)[0]
+    return {(names[a], names[b]) for a, b in arrays.pairs[touching]}
+
+
+def touching_shares(
+    arrays: KinematicArrays, names: Sequence[str], samples: int, seed: int
+) -> dict[frozenset[str], float]:
+    """See :meth:`Robot.touching_shares`."""
+    q = random_configurations(arrays, samples, np.random.default_rng(seed))
+    shares = pairs_touching(arrays, q, arrays.pairs).mean(axis=0)
+    return {
+        frozenset((names[a], names[b])): float(share)
+        for (a, b), share in zip(arrays.pairs, shares, strict=True)
+    }
+
+
+def random_configurations(
+    arrays: KinematicArrays, n: int, rng: np.random.Generator
+) -> Float[np.ndarray, "n dof"]:
+    """Uniform configurations within the limits."""
+    return rng.uniform(arrays.lower, arrays.upper, size=(n, len(arrays.lower)))
+
+
+def _zero_and_random(
+    arrays: KinematicArrays, n: int, rng: np.random.Generator
+) -> Float[np.ndarray, "m dof"]:
+    """The joints' zero, or the limit next to it, and n random configurations."""
+    at_zero = np.clip(np.zeros(len(arrays.lower)), arrays.lower, arrays.upper)
+    return np.vstack([at_zero, random_configurations(arrays, n, rng)])

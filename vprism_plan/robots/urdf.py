@@ -1,0 +1,402 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""A URDF file as a validated tree of links and joints."""
+
+from __future__ import annotations
+
+import functools
+import math
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vprism_plan._files import reading
+from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry, find_mesh
+from vprism_plan.robots.plain_xml import robot_element
+
+MOVING_TYPES = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of the tree; ``lower``/``upper`` are -pi/pi for continuous joints.
+
+    Of a joint that others mimic, they are narrowed so that these stay in their own limits.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    T_origin: np.ndarray
+    axis: np.ndarray
+    lower: float
+    upper: float
+    velocity: float
+    mimic: tuple[str, float, float] | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether the joint has a degree of freedom (its own or a mimicked one)."""
+        return self.kind in MOVING_TYPES
+
+
+@dataclass(frozen=True)
+class Link:
+    """A link with its collision geometry: primitives, and meshes that are not read yet."""
+
+    name: str
+    primitives: tuple[PrimitiveGeometry, ...] = ()
+    meshes: tuple[MeshFile, ...] = ()
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A tree of links: ``joints`` are ordered so that parents come first."""
+
+    name: str
+    root: str
+    links: dict[str, Link]
+    joints: tuple[Joint, ...]
+
+    @functools.cached_property
+    def joint_map(self) -> dict[str, Joint]:
+        """The joints by name."""
+        return {joint.name: joint for joint in self.joints}
+
+    @property
+    def actuated(self) -> tuple[str, ...]:
+        """Names of the joints that move and do not mimic another."""
+        return tuple(j.name for j in self.joints if j.moves and j.mimic is None)
+
+    def resolve_mimic(self, name: str) -> tuple[str, float, float]:
+        """Follow a chain of mimic joints to its driver.
+
+        Returns:
+            (driver, multiplier, offset): value = multiplier * driver + offset.
+        """
+        multiplier, offset = 1.0, 0.0
+        mimic = self.joint_map[name].mimic
+        while mimic is not None:
+            name, factor, shift = mimic
+            offset += multiplier * shift
+            multiplier *= factor
+            mimic = self.joint_map[name].mimic
+        return name, multiplier, offset
+
+
+_FARTHEST_LIMIT = 1e4  # radians or metres; SDF writes 1e16 for "none"
+_SMALLEST, _LARGEST = 1e-6, 1e3  # metres of a solid, which is cut into tiles
+# Tables of a robot grow with the square of its links; PR2 has 90.
+_MOST_LINKS = 1000
+_ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
+# Of each solid, the attributes of its size, and how many numbers these hold.
+_SIZES = {"box": (("size",), 3), "cylinder": (("radius", "length"), 2), "sphere": (("radius",), 1)}
+
+
+def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel:
+    """Read a URDF file.
+
+    Only what kinematics and collision need is looked at: visuals, inertias, transmissions and
+    simulator tags vary most between files, and a mistake in them must not stop a planner.
+
+    Raises:
+        RobotError: The file is missing or malformed, or describes something that
+            is not a tree of links joined by revolute, continuous, prismatic and
+            fixed joints.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise RobotError(f"no URDF file at '{path}'; give the path of an existing .urdf file")
+    with reading(path, "a usable URDF (check_urdf may say more)", RobotError):
+        root = robot_element(path, "a URDF")
+        if any("xacro" in element.tag for element in root.iter()):
+            raise RobotError(f"'{path}' holds xacro macros; expand it first: xacro IN > OUT.urdf")
+        links = root.findall("link")
+        if len(links) > _MOST_LINKS:
+            raise RobotError(f"'{path}' has {len(links):,} links; at most {_MOST_LINKS:,} are read")
+        return build_tree(
+            root.get("name", path.stem),
+            [_link(element, path, package_dirs) for element in links],
+            [_joint(element, path) for element in root.findall("joint")],
+            path,
+        )
+
+
+def _name(element: ET.Element, path: Path) -> str:
+    name = element.get("name")
+    if not name:
+        raise RobotError(f"a <{element.tag}> in '{path}' has no 'name'")
+    return name
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.split()]
+
+
+def _number(element: ET.Element | None, key: str) -> float | None:
+    text = None if element is None else element.get(key)
+    return None if text is None else float(text)
+
+
+def _origin(owner: ET.Element, whose: str, path: Path) -> np.ndarray:
+    """Where an <origin> puts its owner, (4, 4)."""
+    import trimesh.transformations
+
+    element = owner.find("origin")
+    if element is None:
+        return np.eye(4)
+    parts = {}
+    for key in ("xyz", "rpy"):
+        text = element.get(key, "0 0 0")
+        try:
+            parts[key] = _numbers(text)
+        except ValueError:
+            parts[key] = []
+        if len(parts[key]) != 3 or not all(map(math.isfinite, parts[key])):
+            raise RobotError(
+                f"{whose} in '{path}' has an <origin> with {key}={text!r}; write finite numbers, "
+                "three of them"
+            )
+    T = trimesh.transformations.compose_matrix(translate=parts["xyz"], angles=parts["rpy"])
+    return np.array(T, dtype=np.float64)
+
+
+def _link(element: ET.Element, path: Path, package_dirs: PackageDirs) -> Link:
+    primitives, meshes = [], []
+    name = _name(element, path)
+    for collision in element.findall("collision"):
+        T = _origin(collision, f"link '{name}'", path)
+        shape = collision.find("geometry/*")
+        if shape is None:
+            raise RobotError(f"link '{name}' in '{path}' has a <collision> without a shape")
+        if shape.tag == "mesh":
+            meshes.append(_mesh(name, shape, T, path, package_dirs))
+        else:
+            primitives.append(_primitive(name, shape, T, path))
+    return Link(name, tuple(primitives), tuple(meshes))
+
+
+def _mesh(
+    link: str, mesh: ET.Element, T: np.ndarray, path: Path, package_dirs: PackageDirs
+) -> MeshFile:
+    filename = mesh.get("filename")
+    if not filename:
+        raise RobotError(f"link '{link}' in '{path}' has a <mesh> without a filename; name a file")
+    scale = np.array(_numbers(mesh.get("scale", "").replace(",", " ")) or [1.0])
+    scale = np.full(3, scale[0]) if len(scale) == 1 else scale
+    if scale.shape != (3,) or not np.isfinite(scale).all() or (scale == 0.0).any():
+        raise RobotError(
+            f"link '{link}' in '{path}' has a mesh with scale {scale.tolist()}; write three finite "
+            "numbers other than 0"
+        )
+    found, searched = find_mesh(filename, path, package_dirs)
+    return MeshFile(link, filename, scale, T, found, tuple(searched))
+
+
+def _primitive(link: str, shape: ET.Element, T: np.ndarray, path: Path) -> PrimitiveGeometry:
+    kind: Any = shape.tag
+    if kind not in _SIZES:
+        raise RobotError(f"link '{link}' in '{path}' has a collision shape of Unknown tag: {kind}")
+    keys, expected = _SIZES[kind]
+    size = tuple(_numbers(" ".join(shape.attrib[key].replace(",", " ") for key in keys)))
+    if len(size) != expected or not all(_SMALLEST <= v <= _LARGEST for v in size):
+        raise RobotError(
+            f"link '{link}' in '{path}' has a {kind} of size {size}; "
+            f"sizes must be positive and finite, from {_SMALLEST:g} to {_LARGEST:g} m"
+        )
+    return PrimitiveGeometry(kind, size, T)
+
+
+def _joint(element: ET.Element, path: Path) -> Joint:
+    name, kind = _name(element, path), element.get("type", "")
+    ends = {}
+    for part in ("parent", "child"):
+        end = element.find(part)
+        ends[part] = "" if end is None else end.get("link", "")
+        if not ends[part]:
+            raise RobotError(f"joint '{name}' in '{path}' names no {part} link")
+    if kind not in _ALL_TYPES:
+        raise RobotError(f"joint '{name}' in '{path}' has type {kind!r}; valid: {_ALL_TYPES}")
+    if kind in ("floating", "planar"):
+        raise RobotError(
+            f"joint '{name}' is {kind}; supported are revolute, continuous, prismatic and "
+            "fixed. Replace it by a fixed joint and place the robot with base_pose"
+        )
+    T = _origin(element, f"joint '{name}'", path)
+    mimic, copied = None, element.find("mimic")
+    if copied is not None and kind != "fixed":
+        factors = float(copied.get("multiplier", 1.0)), float(copied.get("offset", 0.0))
+        mimic = (copied.get("joint", ""), *factors)
+        if not all(map(math.isfinite, factors)):
+            raise RobotError(f"joint '{name}' in '{path}' has a non-finite mimic factor: {mimic}")
+    lower, upper, velocity = _limits(element, name, kind, path)
+    axis = _axis(element, name, kind, path) if kind != "fixed" else np.array([1.0, 0.0, 0.0])
+    return Joint(name, kind, ends["parent"], ends["child"], T, axis, lower, upper, velocity, mimic)
+
+
+def _axis(joint: ET.Element, name: str, kind: str, path: Path) -> np.ndarray:
+    element = joint.find("axis")
+    axis = np.array(_numbers("1 0 0" if element is None else element.get("xyz", "1 0 0")))
+    norm = float(np.linalg.norm(axis)) if axis.shape == (3,) else math.nan
+    if not (math.isfinite(norm) and norm > 1e-9):
+        raise RobotError(
+            f"joint '{name}' in '{path}' has axis {axis.tolist()}; "
+            "an axis needs three finite numbers, not all zero"
+        )
+    if kind == "prismatic" and abs(norm - 1.0) > 1e-3:
+        # Tools disagree on whether the travel is scaled by the axis length.
+        raise RobotError(
+            f"prismatic joint '{name}' in '{path}' has an axis of length {norm:.6g}; "
+            "write a unit axis"
+        )
+    return axis / norm
+
+
+def _limits(joint: ET.Element, name: str, kind: str, path: Path) -> tuple[float, float, float]:
+    """Lower, upper and velocity limit; a velocity of 0 or none stated becomes inf.
+
+    Soft limits of a <safety_controller> narrow the range, as MoveIt has it: beyond them a
+    controller pushes back. Continuous joints have none.
+    """
+    limit, soft = joint.find("limit"), joint.find("safety_controller")
+    velocity = _number(limit, "velocity") or math.inf
+    if not velocity >= 0.0:
+        raise RobotError(
+            f"joint '{name}' in '{path}' has velocity limit {velocity}; it must be positive"
+        )
+    if kind == "continuous":
+        return -math.pi, math.pi, velocity
+    if kind == "fixed":
+        return 0.0, 0.0, velocity
+    lower, upper = _number(limit, "lower"), _number(limit, "upper")
+    if lower is None or upper is None:
+        raise RobotError(
+            f"{kind} joint '{name}' in '{path}' has no lower and upper <limit>; "
+            "state both, or make it continuous"
+        )
+    if not (math.isfinite(lower) and math.isfinite(upper)) or lower > upper:
+        raise RobotError(
+            f"joint '{name}' in '{path}' has limits [{lower}, {upper}]; "
+            "they must be finite with lower <= upper"
+        )
+    if max(abs(lower), abs(upper)) > _FARTHEST_LIMIT:
+        raise RobotError(
+            f"joint '{name}' in '{path}' has limits [{lower:g}, {upper:g}], beyond "
+            f"{_FARTHEST_LIMIT:g}; no search covers that: make it continuous, or state real limits"
+        )
+    low, high = _number(soft, "soft_lower_limit"), _number(soft, "soft_upper_limit")
+    low, high = (lower if low is None else low), (upper if high is None else high)
+    lower, upper = max(lower, low), min(upper, high)
+    if not (math.isfinite(low) and math.isfinite(high) and lower <= upper):
+        raise RobotError(
+            f"joint '{name}' in '{path}' has a <safety_controller> whose soft limits "
+            f"[{low:g}, {high:g}] leave nothing of its range; correct them, or take it out"
+        )
+    return lower, upper, velocity
+
+
+def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) -> RobotModel:
+    """Order joints parents first, refusing anything that is not one tree.
+
+    Raises:
+        RobotError: Names are not unique or unknown, the joints do not make one tree, or a
+            joint mimics what it cannot.
+    """
+    link_map = {link.name: link for link in links}
+    for what, named in (("link", links), ("joint", joints)):
+        counts = Counter(item.name for item in named)
+        duplicates = sorted(name for name, count in counts.items() if count > 1)
+        if duplicates:
+            raise RobotError(f"{what} names {duplicates} occur more than once in '{path}'")
+    if not links:
+        raise RobotError(f"'{path}' has no links")
+    parent_joint: dict[str, Joint] = {}
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            if link not in link_map:
+                raise RobotError(
+                    f"joint '{joint.name}' in '{path}' refers to unknown link '{link}'; "
+                    f"links: {sorted(link_map)}"
+                )
+        if joint.child in parent_joint:
+            raise RobotError(
+                f"link '{joint.child}' in '{path}' has two parent joints: "
+                f"'{parent_joint[joint.child].name}' and '{joint.name}'; a URDF is a tree"
+            )
+        parent_joint[joint.child] = joint
+    roots = [link.name for link in links if link.name not in parent_joint]
+    if len(roots) != 1:
+        what = f"several roots {roots}" if roots else "no root: its joints form a cycle"
+        raise RobotError(f"'{path}' has {what}; a URDF has exactly one link without a parent")
+    # Parents first: what hangs below each link, link by link.
+    ordered: list[Joint] = []
+    queue = list(roots)
+    for link in queue:
+        below = [joint for joint in joints if joint.parent == link]
+        ordered += below
+        queue += [joint.child for joint in below]
+    if len(ordered) != len(joints):
+        lost = sorted({joint.name for joint in joints} - {joint.name for joint in ordered})
+        raise RobotError(f"joints {lost} in '{path}' form a cycle; a URDF is a tree")
+    model = RobotModel(name, roots[0], link_map, tuple(ordered))
+    _check_mimics(model, path)
+    narrowed = _narrowed(model, path)
+    return replace(model, joints=tuple(narrowed.get(joint.name, joint) for joint in ordered))
+
+
+def _check_mimics(model: RobotModel, path: Path) -> None:
+    for joint in model.joints:
+        seen, current = {joint.name}, joint
+        while current.mimic is not None:
+            driver = current.mimic[0]
+            if driver not in model.joint_map or not model.joint_map[driver].moves:
+                raise RobotError(
+                    f"joint '{current.name}' in '{path}' mimics '{driver}', which is no moving "
+                    f"joint; valid: {[j.name for j in model.joints if j.moves]}"
+                )
+            if driver in seen:
+                raise RobotError(f"joint '{joint.name}' in '{path}' mimics itself through {seen}")
+            seen.add(driver)
+            current = model.joint_map[driver]
+
+
+def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
+    """The joints that others mimic, with limits that keep these in their own.
+
+    A continuous joint becomes a revolute one if a limited joint follows it: where it may
+    turn without end, what follows it may not. So it does, within [-pi, pi], if a continuous
+    joint follows it by a factor that is no integer: that is elsewhere after a whole turn.
+    """
+    result: dict[str, Joint] = {}
+    followers = [joint for joint in model.joints if joint.moves and joint.mimic is not None]
+    for joint in sorted(followers, key=lambda joint: joint.kind == "continuous"):
+        name, factor, offset = model.resolve_mimic(joint.name)
+        driver = result.get(name, model.joint_map[name])
+        turns = driver.kind == "continuous"
+        if joint.kind == "continuous":
+            if turns and abs(factor - round(factor)) > 1e-9:
+                result[name] = replace(driver, kind="revolute")
+            continue
+        if factor == 0.0:
+            within = joint.lower <= offset <= joint.upper
+            low, high = (-math.inf, math.inf) if within else (1.0, 0.0)
+        else:
+            low, high = sorted((end - offset) / factor for end in (joint.lower, joint.upper))
+        lower = low if turns else max(driver.lower, low)
+        upper = high if turns else min(driver.upper, high)
+        if lower > upper + 1e-9:
+            raise RobotError(
+                f"joint '{joint.name}' in '{path}' mimics '{name}' ({factor:g} * value + "
+                f"{offset:g}) and stays in its limits [{joint.lower:g}, {joint.upper:g}] for no "
+                f"value of '{name}' in [{driver.lower:g}, {driver.upper:g}]; correct the limits, "
+                "the multiplier or the offset"
+            )
+        if not (turns and math.isinf(lower)):
+            kind = "revolute" if turns else driver.kind
+            result[name] = replace(driver, kind=kind, lower=lower, upper=max(lower, upper))
+    return result
