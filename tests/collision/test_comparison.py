@@ -10,8 +10,8 @@ from oracles.world_oracles import KernelMap, random_map
 
 import vprism_plan as vp
 from vprism_plan.collision import compare
-from vprism_plan.collision.comparison import causes_between
-from vprism_plan.collision.mesh_reports import (
+from vprism_plan.collision.mesh.comparison import causes_between
+from vprism_plan.collision.mesh.reports import (
     Cause,
     CauseKind,
     Comparison,

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from vprism_plan._numbers import is_number, is_whole
 from vprism_plan.errors import ConfigError
@@ -107,3 +108,35 @@ def _checked_contacts(contacts: Any) -> dict[str, frozenset[int]]:
             )
         checked[str(name)] = frozenset(int(i) for i in ids)
     return checked
+
+
+def contact_rules(
+    robot: Any, allowed: Mapping[str, Collection[int]]
+) -> tuple[list[frozenset[int]], Int[np.ndarray, " links"]]:
+    """Turn allowed contacts into distinct rules.
+
+    Args:
+        robot: whose links and groups are named: has `link_names`, and `links_of(name)` as
+            `vprism_plan.robots.Robot` does.
+        allowed: link or SRDF group -> ids of the objects it may touch; what several
+            entries say of one link adds up.
+
+    Returns:
+        The sets of objects that may be touched, the empty one first, and the index of the
+        set that holds for each link.
+
+    Raises:
+        RobotError: no such link or group.
+    """
+    names = list(robot.link_names)
+    per_link: list[set[int]] = [set() for _ in names]
+    for name, ids in allowed.items():
+        for link in robot.links_of(name):
+            per_link[names.index(link)].update(int(i) for i in ids)
+    rules = [frozenset[int]()]
+    index = np.zeros(len(names), dtype=np.int64)
+    for number, own in enumerate(map(frozenset, per_link)):
+        if own not in rules:
+            rules.append(own)
+        index[number] = rules.index(own)
+    return rules, index

@@ -8,30 +8,16 @@ from typing import Any, Literal
 from vprism_plan.collision.reports import Contact
 
 CauseKind = Literal[
-    # the field refuses, meshes accept
-    "conservative spheres",
-    "margin",
-    "voxel inflation",
-    "occluded",
-    "unobserved",
-    "background",
-    "thin seen part",
-    "too small for the mesh",
-    # meshes refuse, the field accepts
-    "solids outside spheres",
-    "coarse mesh",
-    "rounding",
-    "edge tolerance",
-    "missed by the field",
+    "conservative spheres", "margin", "voxel inflation", "occluded", "unobserved", "background",
+    "thin seen part", "too small for the mesh",
+    "solids outside spheres", "coarse mesh", "rounding", "edge tolerance", "missed by the field",
     "seen by a camera",
-    # either
-    "contact rules",
-    "posterior risk",
-    "unexplained",
-]
+    "contact rules", "posterior risk", "unexplained",
+]  # fmt: skip
 
 SEEN = "a camera saw it there"  # the detail of contacts with observed points
-_SPOKEN: dict[str, str] = {
+_WHY: dict[CauseKind, str] = {
+    # the field refuses, meshes accept
     "conservative spheres": "the link's spheres reach it, its solids do not",
     "margin": "nothing touches, but the field's checker keeps a margin",
     "voxel inflation": "the field's cells reach beyond the surface",
@@ -40,6 +26,7 @@ _SPOKEN: dict[str, str] = {
     "background": "its cells reach farther than the points of the unlabelled clutter",
     "thin seen part": "its cells reach farther than the points of a part that the map smooths away",
     "too small for the mesh": "the object has no surface on the mesh's lattice",
+    # meshes refuse, the field accepts
     "solids outside spheres": "the link's spheres do not hold its solids",
     "coarse mesh": "the mesh reaches beyond the level set",
     "rounding": "the two differ by less than FCL's tolerance",
@@ -47,6 +34,7 @@ _SPOKEN: dict[str, str] = {
     "missed by the field": "the map, or the shadow of what was seen, says occupied and the field "
     "says free",
     "seen by a camera": "the checker missed what a camera saw there",
+    # either
     "contact rules": "the two permit different contacts",
     "posterior risk": "posterior worlds judge the objects",
     "unexplained": "no known cause",
@@ -72,7 +60,7 @@ class Cause:
 
     def text(self) -> str:
         """Return the cause as one phrase."""
-        return f"{self.link} and {self.body}: {self.kind} ({_SPOKEN[self.kind]})"
+        return f"{self.link} and {self.body}: {self.kind} ({_WHY[self.kind]})"
 
 
 @dataclass(frozen=True)
@@ -118,9 +106,7 @@ class Comparison:
 
     def counts(self) -> dict[str, int]:
         """How many configurations each kind of cause has a part in."""
-        return dict(
-            Counter(kind for d in self.disagreements for kind in {c.kind for c in d.causes})
-        )
+        return dict(Counter(k for d in self.disagreements for k in {c.kind for c in d.causes}))
 
     def text(self) -> str:
         """Return the comparison in one line."""
@@ -154,9 +140,17 @@ class PathFinding:
         """Return the finding in one line."""
         reasons = "; ".join(contact.text() for contact in self.contacts)
         why = "; ".join(cause.text() for cause in self.causes)
-        return f"edge {self.edge} at {self.fraction:.3f}: {reasons}" + (
-            f" (why: {why})" if why else ""
-        )
+        why = f" (why: {why})" if why else ""
+        return f"edge {self.edge} at {self.fraction:.3f}: {reasons}{why}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return {
+            **vars(self),
+            "configuration": list(self.configuration),
+            "contacts": [contact.to_dict() for contact in self.contacts],
+            "causes": [dict(vars(cause)) for cause in self.causes],
+        }
 
 
 @dataclass(frozen=True)
@@ -186,22 +180,4 @@ class PathOpinion:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready keys."""
-        return {
-            "valid": self.valid,
-            "judge": self.judge,
-            "step": self.step,
-            "configurations": self.configurations,
-            "findings": [
-                {
-                    "edge": found.edge,
-                    "fraction": found.fraction,
-                    "configuration": list(found.configuration),
-                    "contacts": [contact.to_dict() for contact in found.contacts],
-                    "causes": [
-                        {"kind": c.kind, "link": c.link, "body": c.body, "amount": c.amount}
-                        for c in found.causes
-                    ],
-                }
-                for found in self.findings
-            ],
-        }
+        return {**vars(self), "findings": [found.to_dict() for found in self.findings]}

@@ -2,56 +2,24 @@
 """Where the distance field and the meshes disagree, and why."""
 
 import math
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.collision import _fcl
-from vprism_plan.collision._mesh_world import MeshWorld
-from vprism_plan.collision.mesh_reports import SEEN, Cause, CauseKind, Comparison, Disagreement
-from vprism_plan.collision.protocols import Numbers
+from vprism_plan.collision.inputs import Numbers, configurations
+from vprism_plan.collision.mesh import fcl
+from vprism_plan.collision.mesh.reports import SEEN, Cause, CauseKind, Comparison, Disagreement
+from vprism_plan.collision.mesh.solids import sphere_centers
 from vprism_plan.collision.reports import Contact
-from vprism_plan.errors import RobotError
-from vprism_plan.robots import Robot
-from vprism_plan.robots._values import joint_values
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
 # Grid steps that the field may refuse beyond a surface: its interpolation gives up less than
 # one (half a cell's diagonal), its cover less than half.
 _INFLATION = 1.5
-_UNSEEN: dict[str, CauseKind] = {
-    "occluded": "occluded",
-    "unobserved": "unobserved",
-    "background": "background",
-}
 
 
-@runtime_checkable
-class SurfaceChecker(Protocol):
-    """What a comparison asks of `MeshChecker`."""
-
-    robot: Robot
-    surfaces: MeshWorld
-
-    def is_valid(self, q: Numbers) -> bool:
-        """Verdict on a configuration."""
-        ...
-
-    def contacts(self, q: Numbers) -> tuple[Contact, ...]:
-        """Reasons to refuse it."""
-        ...
-
-    def allows(self, link: str, body: str) -> bool:
-        """Whether a link may touch a body."""
-        ...
-
-    def link_distance(self, q: Numbers, link: str, body: str) -> float:
-        """Distance from a link to a body, metres."""
-        ...
-
-
-def compare(checker: Any, mesh_checker: SurfaceChecker, Q: Numbers) -> Comparison:
+def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
     """Compare the verdicts of the field and of meshes, and name a cause for every difference.
 
     Args:
@@ -66,12 +34,8 @@ def compare(checker: Any, mesh_checker: SurfaceChecker, Q: Numbers) -> Compariso
     Raises:
         RobotError: Q does not have shape (n, dof) or is not finite.
     """
-    rows = joint_values(Q, mesh_checker.robot, "Q")
-    if rows.ndim != 2:
-        raise RobotError(f"Q has shape {rows.shape}; it must be (n, {mesh_checker.robot.dof})")
     both, neither, found = 0, 0, []
-    for index, row in enumerate(rows):
-        q = mesh_checker.robot.check_configuration(row)
+    for index, q in enumerate(configurations(mesh_checker.robot, Q, finite=True)):
         by_field, by_mesh = bool(checker.is_valid(q)), mesh_checker.is_valid(q)
         if by_field == by_mesh:
             both += by_field
@@ -83,7 +47,7 @@ def compare(checker: Any, mesh_checker: SurfaceChecker, Q: Numbers) -> Compariso
 
 
 def causes_between(
-    checker: Any, mesh_checker: SurfaceChecker, q: Float[np.ndarray, "dof"]
+    checker: Any, mesh_checker: Any, q: Float[np.ndarray, "dof"]
 ) -> tuple[Cause, ...]:
     """Name why the two disagree on q; "edge tolerance" if both refuse it, empty if none does."""
     by_field = checker.explain(q)
@@ -98,13 +62,11 @@ def causes_between(
 # --- the field refuses, meshes accept ------------------------------------------------
 
 
-def _of_field(
-    checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
-) -> Cause:
-    kind: CauseKind
+def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
+    kind: Any
     amount = contact.depth
-    if contact.body in _UNSEEN:
-        kind = _UNSEEN[contact.body]
+    if contact.body in {"occluded", "unobserved", "background"}:
+        kind = contact.body
     elif contact.kind == "risk":
         kind = "posterior risk"
     elif contact.kind == "object" and meshes.allows(contact.link, contact.body):
@@ -123,11 +85,12 @@ def _of_field(
 
 
 def _of_surface(
-    checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
+    checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]
 ) -> tuple[CauseKind, float]:
     """Cause and amount where the field refuses a sphere for an object or known geometry."""
     margin = float(checker.config.margin)
-    center, radius = sphere_at(meshes, q, contact.sphere)
+    center = sphere_centers(meshes.robot, q)[contact.sphere]
+    radius = float(meshes.robot.sphere_radii[contact.sphere])
     gap = _ball_gap(meshes, center, radius, contact.body)
     left = meshes.link_distance(q, contact.link, contact.body)
     if gap <= _TOLERANCE and left > gap + _TOLERANCE:
@@ -143,19 +106,7 @@ def _of_surface(
     return "voxel inflation" if gap <= within else "unexplained", gap
 
 
-def sphere_at(
-    meshes: SurfaceChecker, q: Float[np.ndarray, "dof"], sphere: int
-) -> tuple[Float[np.ndarray, "3"], float]:
-    """World centre and radius of a collision sphere, metres."""
-    import torch
-
-    center = meshes.robot.sphere_centers(torch.from_numpy(q)).numpy()[sphere]
-    return center, float(meshes.robot.sphere_radii[sphere])
-
-
-def _ball_gap(
-    meshes: SurfaceChecker, center: Float[np.ndarray, "3"], radius: float, named: str
-) -> float:
+def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named: str) -> float:
     """Signed distance of a ball to the surfaces of the kind that a contact names.
 
     For an object: to any of them, since the field names the nearest to a grid node.
@@ -168,11 +119,11 @@ def _ball_gap(
         if body.name != named and not (objects and body.class_index):
             continue
         if not body.shape.hollow:
-            ball = _fcl.Shape("sphere", (radius,))
+            ball = fcl.Shape("sphere", (radius,))
             ball.place(np.eye(3), center)
-            best = min(best, _fcl.signed_gap(body.shape, ball))
+            best = min(best, fcl.signed_gap(body.shape, ball))
             continue
-        way, _ = _fcl.point_distance(body.shape, center)
+        way, _ = fcl.point_distance(body.shape, center)
         hidden = inside if objects else body.contains(center)
         best = min(best, (-way if hidden else way) - radius)
     return best
@@ -190,9 +141,7 @@ def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: flo
 # --- meshes refuse, the field accepts ------------------------------------------------
 
 
-def _of_mesh(
-    checker: Any, meshes: SurfaceChecker, contact: Contact, q: Float[np.ndarray, "dof"]
-) -> Cause:
+def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
     kind: CauseKind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
@@ -234,19 +183,13 @@ def _field_allows(checker: Any, contact: Contact) -> bool:
 
 
 def _in_spheres(
-    meshes: SurfaceChecker,
-    q: Float[np.ndarray, "dof"],
-    links: tuple[str, ...],
-    contact: Contact,
+    meshes: Any, q: Float[np.ndarray, "dof"], links: tuple[str, ...], contact: Contact
 ) -> bool:
     """Whether the collision spheres of each link are as near to the place of a contact as the
     solids are, to FCL's tolerance."""
-    import torch
-
     point, apart = np.array(contact.position), max(0.0, contact.required - contact.depth)
-
     robot = meshes.robot
-    centers = robot.sphere_centers(torch.from_numpy(q)).numpy()
-    held = np.linalg.norm(centers - point, axis=1) <= robot.sphere_radii + apart + _TOLERANCE
+    away = np.linalg.norm(sphere_centers(robot, q) - point, axis=1)
+    held = away <= robot.sphere_radii + apart + _TOLERANCE
     owners = {robot.link_names[int(link)] for link in robot.sphere_links[held]}
     return owners >= set(links)

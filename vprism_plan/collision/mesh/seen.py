@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from vprism_plan.collision._solids import PlacedSolids
-from vprism_plan.collision.mesh_reports import SEEN
+from vprism_plan.collision.mesh.reports import SEEN
+from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots._sphere_checks import drawn_points
 from vprism_plan.world import visibility
 from vprism_plan.world.lost_depth import lost_cones, lost_points
@@ -29,9 +29,6 @@ class SeenPoints:
     Those of the robot are none, nor are flying pixels: the same pixels count as for the world,
     but all of them, however near they lie to the map's surfaces. Where a labelled pixel has no
     depth, the points where its object may be, a grid step apart.
-
-    Args:
-        world: a `World`.
 
     Attributes:
         bodies: what the points show, and how that is known: ("object:3", SEEN), ...
@@ -80,14 +77,8 @@ class SeenPoints:
     def inside(
         self, placed: PlacedSolids, i: int, need: float, allowed: Bool[np.ndarray, "classes"]
     ) -> Iterator[int]:
-        """Points within `need` (metres) of a solid, those that seem deepest first.
-
-        Args:
-            placed: the robot's solids.
-            i: which.
-            need: distance to keep.
-            allowed: classes that it may touch.
-        """
+        """Points within `need` (metres) of solid i, those that seem deepest first; none of the
+        classes that it is allowed to touch."""
         rows = self._around(placed, i, need)
         rows = rows[~allowed[self.classes[self.body[rows]]]]
         if len(rows):
@@ -104,7 +95,8 @@ class SeenPoints:
             rows = self._around(placed, i, max(best, 0.0))
         rows = rows[~allowed[self.classes[self.body[rows]]]]
         bound = placed.solids[i].bound(placed.to_link(i, self.points[rows])) - self.half[rows]
-        for row, least in sorted(zip(rows.tolist(), bound.tolist(), strict=True), key=_second):
+        order = np.argsort(bound, kind="stable")
+        for row, least in zip(rows[order].tolist(), bound[order].tolist(), strict=True):
             if least >= best:
                 break
             best = min(best, placed.point_gap(i, self.points[row]) - float(self.half[row]))
@@ -139,20 +131,11 @@ def judged_field(world: Any) -> Any:
     return world.field if beyond is None else beyond
 
 
-def _second(pair: tuple[int, float]) -> float:
-    return pair[1]
-
-
 class HiddenSpace:
     """What no camera saw, by the world's policies, asked at points of the robot's surface.
 
     One point per cube of 3 cm of each moving solid's surface, moved outward by its padding.
     What lies between the points is not noticed.
-
-    Args:
-        world: a `World`.
-        placed: the robot's solids.
-        padding: (n,) metres of each.
     """
 
     def __init__(self, world: Any, placed: PlacedSolids, padding: Float[np.ndarray, "n"]) -> None:
