@@ -179,7 +179,8 @@ class CollisionChecker:
         Raises:
             RobotError: An end does not have shape (dof,).
         """
-        return self.check_motion_buffer(*(configuration(self.robot, q) for q in (qa, qb)))
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
+        return self.check_motion_buffer(qa, qb)
 
     def check_motion_buffer(
         self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
@@ -307,23 +308,10 @@ class CollisionChecker:
 
     # --- margins ---------------------------------------------------------------------------
 
-    def safety_margin(self, q_or_path: Numbers, tolerance: float = 0.002) -> margins.SafetyMargins:
-        """Return the margin of every link to every obstacle; see `margins.safety_margin`."""
-        return margins.safety_margin(self, q_or_path, tolerance)
-
-    def min_clearance(self, path: Numbers, tolerance: float = 0.0005) -> motion.PathClearance:
-        """Return a bound on the clearance over a path; see `motion.min_clearance`."""
-        return motion.min_clearance(self, path, tolerance)
-
-    def max_safe_motion(
-        self, q: Numbers, dq: Numbers, tolerance: float = 0.0005
-    ) -> motion.SafeMotion:
-        """Return how far along dq stays safe; see `motion.max_safe_motion`."""
-        return motion.max_safe_motion(self, q, dq, tolerance)
-
-    def path_entropy(self, q_or_path: Numbers, resolution: float = 0.01) -> entropy.PathEntropy:
-        """Return the map's entropy where the robot sweeps; see `entropy.path_entropy`."""
-        return entropy.path_entropy(self, q_or_path, resolution)
+    safety_margin = margins.safety_margin
+    min_clearance = motion.min_clearance
+    max_safe_motion = motion.max_safe_motion
+    path_entropy = entropy.path_entropy
 
     # --- risk --------------------------------------------------------------------------
     @property

@@ -24,7 +24,10 @@ def configuration(robot: Any, q: Numbers) -> Float[np.ndarray, "dof"]:
     Raises:
         RobotError: the shape is wrong.
     """
-    return _read(robot, q, "a configuration", 1)
+    array = joint_values(q, robot, "a configuration")
+    if array.shape != (robot.dof,):
+        raise _wrong_shape(robot, array, "a configuration", f"({robot.dof},)")
+    return array
 
 
 def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Float[np.ndarray, "n dof"]:
@@ -33,7 +36,9 @@ def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Float[np.nda
     Raises:
         RobotError: the shape is wrong, or a value is not finite where it must be.
     """
-    array = _read(robot, Q, "configurations", 2)
+    array = joint_values(Q, robot, "configurations")
+    if array.ndim != 2 or array.shape[1] != robot.dof:
+        raise _wrong_shape(robot, array, "configurations", f"(n, {robot.dof})")
     if finite and not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise RobotError(
@@ -56,10 +61,11 @@ def waypoints(robot: Any, path: Numbers, single: bool = False) -> Float[np.ndarr
             lose their last digits there, and motions their bounds), or a sliding joint leaves
             its limits.
     """
-    array = _read(robot, path, "a path", *((2, 1) if single else (2,)))
-    rows = array[None] if array.ndim == 1 else array
-    if len(rows) == 0:
-        raise RobotError(f"a path has shape {rows.shape}; it needs at least one waypoint")
+    array = joint_values(path, robot, "a path")
+    rows = array[None] if single and array.ndim == 1 else array
+    if rows.ndim != 2 or rows.shape[1] != robot.dof or len(rows) == 0:
+        shapes = f"(T, {robot.dof}), T >= 1" + (f", or ({robot.dof},)" if single else "")
+        raise _wrong_shape(robot, array, "a path", shapes)
     near = (np.abs(rows) <= FARTHEST).all(axis=1)
     if not near.all():
         row = int(np.flatnonzero(~near)[0])
@@ -78,16 +84,11 @@ def waypoints(robot: Any, path: Numbers, single: bool = False) -> Float[np.ndarr
     return rows
 
 
-def _read(robot: Any, values: Numbers, what: str, *ranks: int) -> Float[np.ndarray, "..."]:
-    """Joint values of one of some ranks; RobotError if they have another shape."""
-    array = joint_values(values, robot, what)
-    if array.ndim not in ranks or array.shape[-1] != robot.dof:
-        shapes = {1: f"({robot.dof},)", 2: f"(n, {robot.dof})"}
-        raise RobotError(
-            f"{what} has shape {array.shape}; {robot.name} needs "
-            f"{' or '.join(shapes[rank] for rank in ranks)}: {', '.join(robot.joint_names)}"
-        )
-    return array
+def _wrong_shape(robot: Any, array: np.ndarray, what: str, shapes: str) -> RobotError:
+    return RobotError(
+        f"{what} has shape {array.shape}; {robot.name} needs {shapes}: "
+        f"{', '.join(robot.joint_names)}"
+    )
 
 
 def checked_tolerance(tolerance: float) -> float:

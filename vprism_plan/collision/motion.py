@@ -294,14 +294,8 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
         half *= 0.5
         edge = np.repeat(edge[still], 2)
         middle = (middle[still][:, None] + half * np.array([-1.0, 1.0])).reshape(-1)
-    return PathClearance(
-        clearance=best - tolerance,
-        tolerance=tolerance,
-        place=place,
-        q=tuple(float(v) for v in q),
-        configurations=count,
-        motion=float(edges.motion.sum()),
-    )
+    motion, where = float(edges.motion.sum()), tuple(q.tolist())
+    return PathClearance(best - tolerance, tolerance, place, where, count, motion)
 
 
 def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.0005) -> SafeMotion:
@@ -327,14 +321,8 @@ def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.
     safe, refused = march.run()
     reason = None if refused is None else checker.explain(march.at(refused))
     gap = 0.0 if refused is None else (refused - safe) * march.motion
-    return SafeMotion(
-        fraction=safe,
-        refused_at=refused,
-        tolerance=max(gap, 0.5 * march.step * march.motion if march.stepped else 0.0),
-        distance=safe * march.motion,
-        reason=reason,
-        configurations=march.count,
-    )
+    gap = max(gap, 0.5 * march.step * march.motion if march.stepped else 0.0)
+    return SafeMotion(safe, refused, gap, safe * march.motion, reason, march.count)
 
 
 class _March:

@@ -12,21 +12,8 @@ from scipy.special import betaincinv
 
 from vprism_plan._kernels import checking
 from vprism_plan._kernels import risk as kernels
+from vprism_plan.collision import draws
 from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.draws import (
-    CORNER,
-    PADDINGS,
-    Setting,
-    count_at,
-    count_each,
-    count_path,
-    first_contacts,
-    grown,
-    make_setting,
-    recount,
-    risky_contacts,
-    with_margin,
-)
 from vprism_plan.collision.reports import Contact, RiskEstimate
 from vprism_plan.errors import ConfigError
 
@@ -53,9 +40,9 @@ class PathRisk:
     ) -> None:
         # Probabilities are of touching; verdicts keep the margin as well, and touch a voxel
         # at its corners.
-        self.setting = make_setting(world, robot, config, rules, link_rules)
-        self._corners = grown(self.setting, CORNER)
-        self._kept = grown(with_margin(self.setting, config.margin), CORNER)
+        self.setting = draws.make_setting(world, robot, config, rules, link_rules)
+        self._corners = draws.grown(self.setting, draws.CORNER)
+        self._kept = draws.grown(draws.with_margin(self.setting, config.margin), draws.CORNER)
         worlds = self.setting.worlds
         lower, upper = clopper_pearson(config.n_worlds, config.confidence)
         self._lower = np.maximum(lower - worlds.error_occupied, 0.0)
@@ -80,9 +67,9 @@ class PathRisk:
         halvings = self.allowed.bit_length()  # after so many, none is left
         stricter.allowed = self.allowed >> min(level, halvings)
         if level > halvings:
-            if level - halvings > len(PADDINGS):
+            if level - halvings > len(draws.PADDINGS):
                 return None
-            stricter._kept = grown(self._kept, PADDINGS[level - halvings - 1])
+            stricter._kept = draws.grown(self._kept, draws.PADDINGS[level - halvings - 1])
         return stricter
 
     def held_out(self) -> "PathRisk":
@@ -91,7 +78,7 @@ class PathRisk:
             other = copy.copy(self)
             worlds = self.setting.worlds
             other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
-            other._corners = grown(other.setting, CORNER)
+            other._corners = draws.grown(other.setting, draws.CORNER)
             self._held_out = other
         return self._held_out
 
@@ -99,39 +86,39 @@ class PathRisk:
     def accepts(self, path: Float[np.ndarray, "t dof"]) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
         obstacles aside."""
-        return bool(count_path(self._kept, path).touched.sum() <= self.allowed)
+        return bool(draws.count_path(self._kept, path).touched.sum() <= self.allowed)
 
     def accepts_one(self, q: Float[np.ndarray, "dof"]) -> bool:
         """Return `accepts` of one configuration: the quick way."""
-        return count_at(self._kept, q)[1] <= self.allowed
+        return draws.count_at(self._kept, q)[1] <= self.allowed
 
     def accepts_each(self, Q: Float[np.ndarray, "n dof"]) -> Bool[np.ndarray, " n"]:
         """Return `accepts` of each configuration by itself."""
-        return count_each(self._kept, Q).counts <= self.allowed
+        return draws.count_each(self._kept, Q).counts <= self.allowed
 
     def exceeded_at(self, edge: Float[np.ndarray, "2 dof"]) -> float:
         """Return where along an edge, 0 to 1, more worlds have collided than are allowed."""
-        sweep = count_path(self._kept, edge)
+        sweep = draws.count_path(self._kept, edge)
         first = np.sort(sweep.first[sweep.first >= 0])
         return float(first[self.allowed]) / max(1, len(sweep.counts) - 1)
 
     def contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
         """Return which links touch which objects in how many worlds, the most frequent first."""
-        sweep = count_path(self._kept, q[None])
-        return risky_contacts(self._kept, sweep, float(self._upper[int(sweep.touched.sum())]))
+        sweep = draws.count_path(self._kept, q[None])
+        return draws.risky_contacts(self._kept, sweep, float(self._upper[int(sweep.touched.sum())]))
 
     # --- estimates ---------------------------------------------------------------------
     def estimate(self, path: Float[np.ndarray, "t dof"], with_margin: bool = False) -> RiskEstimate:
         """Return the joint probability of collision along a path, or of coming within the
         margin; of a configuration, where the path has one row."""
-        at = grown(self._kept, -CORNER) if with_margin else self.setting
+        at = draws.grown(self._kept, -draws.CORNER) if with_margin else self.setting
         path = path.copy()
         n, inside = at.worlds.n_worlds, 0
-        around = sweep = count_path(self._kept if with_margin else self._corners, path)
+        around = sweep = draws.count_path(self._kept if with_margin else self._corners, path)
         if around.touched.any():
-            sweep = recount(at, around)
+            sweep = draws.recount(at, around)
             # A draw that occupies the centre of a voxel occupies that point, whatever voxels are.
-            inside = int(recount(grown(at, -0.5), around, within=True).touched.sum())
+            inside = int(draws.recount(draws.grown(at, -0.5), around, within=True).touched.sum())
         clear = np.empty(len(path), np.bool_)
         checking.is_valid_batch(path, at.floats, at.ints, *at.packed, clear)
         stats = np.zeros(4)
@@ -154,11 +141,11 @@ class PathRisk:
             certain=certain,
             spacing=at.spacing,
             configurations=len(sweep.centers),
-            trace=lambda: first_contacts(at, path, sweep, edge, float(stats[0])),
+            trace=lambda: draws.first_contacts(at, path, sweep, edge, float(stats[0])),
             volume=lambda: self._shares(at, sweep.centers),
         )
 
-    def _shares(self, at: Setting, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:
+    def _shares(self, at: draws.Setting, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:
         if self._codes is None:
             self._codes = SpaceCodes(at.world)
         return self._codes.shares(centers, at.radii, at.sphere_tables)

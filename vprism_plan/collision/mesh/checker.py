@@ -19,10 +19,9 @@ from jaxtyping import Bool, Float
 from vprism_plan.collision import explain
 from vprism_plan.collision.config import CheckerConfig, contact_rules
 from vprism_plan.collision.inputs import Numbers, configuration, configurations
-from vprism_plan.collision.mesh.comparison import causes_between
+from vprism_plan.collision.mesh.comparison import PathFinding, PathOpinion, causes_between
 from vprism_plan.collision.mesh.fcl import fcl
 from vprism_plan.collision.mesh.queries import Queries
-from vprism_plan.collision.mesh.reports import PathFinding, PathOpinion
 from vprism_plan.collision.mesh.solids import LinkShapes, PlacedSolids, robot_solids, sphere_centers
 from vprism_plan.collision.mesh.world import MeshWorld
 from vprism_plan.collision.reports import Contact, MotionReport, StateReport
@@ -275,7 +274,8 @@ class MeshChecker:
             RobotError: an end does not have shape (dof,).
             ConfigError: the step asks for too many configurations.
         """
-        return self.check_motion_buffer(*(configuration(self.robot, q) for q in (qa, qb)))
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
+        return self.check_motion_buffer(qa, qb)
 
     def check_motion_buffer(
         self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]

@@ -52,7 +52,7 @@ class Queries:
         self._apart = placed.radii[self._pairs].sum(axis=1) + config.self_margin
         # Pairs of solid and body that are never looked at: allowed, or of a fixed link.
         self._ignored = allowed[placed.links][:, surfaces.classes] | ~placed.moving[:, None]
-        self._points = SeenPoints(world) if seen else None
+        self._points = SeenPoints(world, placed, allowed) if seen else None
         self._hidden = HiddenSpace(world, placed, self._padding) if seen else None
 
     def collides(self) -> bool:
@@ -89,9 +89,8 @@ class Queries:
             best = min(best, self._gap(i, b, int(owner[i])) - self._padding[i])
         if self._points is not None:
             for i in np.flatnonzero(placed.moving).tolist():
-                padding, allowed = float(self._padding[i]), self._allowed[placed.links[i]]
-                nearest = self._points.distance(placed, i, best + padding, allowed)
-                best = min(best, nearest - padding)
+                padding = float(self._padding[i])
+                best = min(best, self._points.distance(i, best + padding) - padding)
         return float(best)
 
     def self_clearance(self) -> float:
@@ -189,11 +188,9 @@ class Queries:
 
     def _touches_points(self) -> bool:
         """Whether a moving solid comes too near to an observed point."""
-        points, placed = self._points, self.placed
+        points, need = self._points, self._need
         return points is not None and any(
-            True
-            for i in points.near(placed, self._need)
-            for _ in points.inside(placed, i, float(self._need[i]), self._allowed[placed.links[i]])
+            True for i in points.near(need) for _ in points.inside(i, float(need[i]))
         )
 
     def _unseen(self, margin: float) -> Iterator[tuple[int, str, Float[np.ndarray, "3"]]]:
@@ -278,10 +275,9 @@ class Queries:
         points = self._points
         if points is None:
             return
-        for i in points.near(self.placed, self._need):
+        for i in points.near(self._need):
             need = float(self._need[i])
-            found = points.deepest(self.placed, i, need, self._allowed[self.placed.links[i]])
-            for body, (gap, row) in found.items():
+            for body, (gap, row) in points.deepest(i, need).items():
                 place = points.points[row]
                 out = self.placed.centers[i] - place
                 length = float(np.linalg.norm(out))

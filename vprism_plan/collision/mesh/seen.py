@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from vprism_plan.collision.mesh.reports import SEEN
 from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots._sphere_checks import drawn_points
 from vprism_plan.world import visibility
 from vprism_plan.world.lost_depth import lost_cones, lost_points
 from vprism_plan.world.seen_surfaces import surface_points
 
+SEEN = "a camera saw it there"  # the detail of contacts with observed points
 _CELL = 0.03  # metres: one sample of a solid's surface per cube of this edge
 _DRAWN = 4000  # points per solid from which they are taken
 _ENOUGH = 64  # points of one body whose depth in a solid is worked out, those deepest in its hull
@@ -35,7 +35,10 @@ class SeenPoints:
         classes: (bodies,) class of the map, 0 for what no rule lets a link touch.
     """
 
-    def __init__(self, world: Any) -> None:
+    def __init__(
+        self, world: Any, placed: PlacedSolids, allowed: Bool[np.ndarray, "links classes"]
+    ) -> None:
+        self._placed, self._allowed = placed, allowed[placed.links]
         map_, config = world.map, world.config
         bounded = config.support == "seen"
         points, half = visibility.background_points(
@@ -59,41 +62,28 @@ class SeenPoints:
         self.points = np.concatenate([points for _, points, _ in parts])
         self.half = np.concatenate([half for _, _, half in parts])
         self.body = np.repeat([k for k, _, _ in parts], [len(points) for _, points, _ in parts])
-        self._tree = cKDTree(self.points) if len(self.points) else None
+        self._tree = cKDTree(self.points)
         self._widest = float(np.max(self.half, initial=0.0))
 
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def near(self, placed: PlacedSolids, need: Float[np.ndarray, "n"]) -> list[int]:
+    def near(self, need: Float[np.ndarray, "n"]) -> list[int]:
         """Moving solids whose balls come within `need` (metres) of any point."""
-        if self._tree is None:
-            return []
-        reach = placed.radii + need + self._widest
+        placed, reach = self._placed, self._placed.radii + need + self._widest
         most = float(np.max(reach[placed.moving], initial=0.0))
         away, _ = self._tree.query(placed.centers, distance_upper_bound=most + 1e-9)
         return np.flatnonzero(placed.moving & (away <= reach)).tolist()
 
-    def inside(
-        self, placed: PlacedSolids, i: int, need: float, allowed: Bool[np.ndarray, "classes"]
-    ) -> Iterator[int]:
-        """Points within `need` (metres) of solid i, those that seem deepest first; none of the
-        classes that it is allowed to touch."""
-        rows = self._around(placed, i, need)
-        rows = rows[~allowed[self.classes[self.body[rows]]]]
+    def inside(self, i: int, need: float) -> Iterator[int]:
+        """Points within `need` (metres) of solid i that it may not touch, those that seem
+        deepest first."""
+        rows = self._around(i, need)
         if len(rows):
             reach = self.half[rows] + need
-            for row in placed.points_within(i, self.points[rows], reach):
+            for row in self._placed.points_within(i, self.points[rows], reach):
                 yield int(rows[row])
 
-    def distance(
-        self, placed: PlacedSolids, i: int, best: float, allowed: Bool[np.ndarray, "classes"]
-    ) -> float:
+    def distance(self, i: int, best: float) -> float:
         """Signed distance from a solid to the nearest point, metres; `best` if none is nearer."""
-        rows = np.arange(len(self.points))
-        if np.isfinite(best):
-            rows = self._around(placed, i, max(best, 0.0))
-        rows = rows[~allowed[self.classes[self.body[rows]]]]
+        placed, rows = self._placed, self._around(i, max(best, 0.0))
         bound = placed.solids[i].bound(placed.to_link(i, self.points[rows])) - self.half[rows]
         order = np.argsort(bound, kind="stable")
         for row, least in zip(rows[order].tolist(), bound[order].tolist(), strict=True):
@@ -102,27 +92,27 @@ class SeenPoints:
             best = min(best, placed.point_gap(i, self.points[row]) - float(self.half[row]))
         return best
 
-    def deepest(
-        self, placed: PlacedSolids, i: int, need: float, allowed: Bool[np.ndarray, "classes"]
-    ) -> dict[int, tuple[float, int]]:
+    def deepest(self, i: int, need: float) -> dict[int, tuple[float, int]]:
         """Body -> how far its deepest point is from a solid (signed, metres), and which it is."""
         found: dict[int, tuple[float, int]] = {}
         looked = np.zeros(len(self.bodies), dtype=np.int64)
-        for row in self.inside(placed, i, need, allowed):
+        for row in self.inside(i, need):
             body = int(self.body[row])
             looked[body] += 1
             if looked[body] <= _ENOUGH:
-                gap = placed.point_gap(i, self.points[row]) - float(self.half[row])
+                gap = self._placed.point_gap(i, self.points[row]) - float(self.half[row])
                 if body not in found or gap < found[body][0]:
                     found[body] = gap, row
         return found
 
-    def _around(self, placed: PlacedSolids, i: int, reach: float) -> Int[np.ndarray, "n"]:
-        """Points near a solid's ball."""
-        if self._tree is None:
-            return np.empty(0, dtype=np.int64)
-        ball = float(placed.radii[i]) + reach + self._widest
-        return np.array(self._tree.query_ball_point(placed.centers[i], ball), dtype=np.int64)
+    def _around(self, i: int, reach: float) -> Int[np.ndarray, "n"]:
+        """Points near a solid's ball, but for what it may touch; all, if the reach is infinite."""
+        rows = np.arange(len(self.points))
+        if np.isfinite(reach):
+            ball = float(self._placed.radii[i]) + reach + self._widest
+            found = self._tree.query_ball_point(self._placed.centers[i], ball)
+            rows = np.array(found, dtype=np.int64)
+        return rows[~self._allowed[i, self.classes[self.body[rows]]]]
 
 
 def judged_field(world: Any) -> Any:
