@@ -26,7 +26,7 @@ from experiments.planning_benchmark.grid_world import benchmark_robot
 from experiments.planning_benchmark.problems import tip_sphere
 from vprism_plan._files import replacing, write_text
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.collision._travel import sphere_jacobians
+from vprism_plan.collision.motion import sphere_jacobians
 from vprism_plan.mapping.serialization import load_map
 from vprism_plan.planning import (
     PathCost,

@@ -29,7 +29,7 @@ import vprism_plan as vp
 from experiments.generation import generate
 from experiments.planning_benchmark.grid_world import benchmark_robot
 from vprism_plan._files import write_text
-from vprism_plan.collision._travel import edges_of, place_points
+from vprism_plan.collision.motion import edges_of, place_points
 from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.trajopt import optimize
 from vprism_plan.viz import save_figure

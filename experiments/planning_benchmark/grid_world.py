@@ -41,7 +41,7 @@ class _Inside:
 
 @dataclass(frozen=True, eq=False)
 class GridWorld:
-    """A `BakedWorld` of a distance field and half-spaces; see `collision.protocols`.
+    """A distance field and half-spaces: what `CollisionChecker` asks of a world.
 
     Attributes:
         field: distance to the obstacles.

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from experiments.planning_benchmark.grid_world import views_of
 from experiments.planning_benchmark.truth import Truth
 from vprism_plan.collision import CollisionChecker
-from vprism_plan.collision._travel import place_points, sphere_jacobians
+from vprism_plan.collision.motion import place_points, sphere_jacobians
 from vprism_plan.planning import plan
 from vprism_plan.robots import Robot
 from vprism_plan.robots.kinematics import frame_poses

@@ -21,7 +21,7 @@ from experiments.planning_benchmark.grid_world import (
 )
 from experiments.protocols import TrueScene
 from vprism_plan.collision import CollisionChecker
-from vprism_plan.collision._travel import Edges, edges_of, place_points
+from vprism_plan.collision.motion import Edges, edges_of, place_points
 from vprism_plan.perception import Plane
 from vprism_plan.robots import Robot
 from vprism_plan.robots.kinematics import frame_poses

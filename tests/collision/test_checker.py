@@ -15,7 +15,7 @@ from oracles.random_robots import as_robot, random_arrays, random_q
 
 from vprism_plan._kernels import checking as kernels
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.collision._packing import pack_robot, reach_table
+from vprism_plan.collision.packing import pack_robot, reach_table
 from vprism_plan.errors import ConfigError, RobotError
 
 SPACING = 0.03

@@ -10,13 +10,13 @@ from oracles.world_oracles import KernelMap, random_map
 
 import vprism_plan as vp
 from vprism_plan.collision import compare
-from vprism_plan.collision.comparison import causes_between
-from vprism_plan.collision.mesh_reports import (
+from vprism_plan.collision.mesh.comparison import (
     Cause,
     CauseKind,
     Comparison,
     PathFinding,
     PathOpinion,
+    causes_between,
 )
 from vprism_plan.collision.reports import Contact
 from vprism_plan.errors import RobotError

@@ -10,7 +10,7 @@ from oracles.checker_oracle import BallWorld, self_clearance, sphere_positions
 from oracles.random_robots import as_robot, random_arrays, random_q
 
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.collision._explain import unit_ball_points
+from vprism_plan.collision.explain import unit_ball_points
 
 SPACING = 0.03
 

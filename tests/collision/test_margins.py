@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 import vprism_plan as vp
 from vprism_plan.collision import CollisionChecker
-from vprism_plan.collision._travel import sphere_jacobians
 from vprism_plan.collision.margins import margin_profile, safety_margin
+from vprism_plan.collision.motion import sphere_jacobians
 from vprism_plan.errors import RobotError, WorldError
 from vprism_plan.perception import Plane
 from vprism_plan.world import World, WorldConfig

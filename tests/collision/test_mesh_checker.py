@@ -13,7 +13,7 @@ from oracles.world_oracles import random_map
 from scipy.spatial.transform import Rotation
 
 import vprism_plan as vp
-from vprism_plan.collision import _fcl
+from vprism_plan.collision.mesh import fcl
 from vprism_plan.errors import ConfigError, MissingDependencyError, RobotError
 from vprism_plan.perception import Plane
 from vprism_plan.robots import PrimitiveGeometry
@@ -573,13 +573,13 @@ def test_options_that_fit_nothing_are_named(world, flyer, options, error, match)
 
 
 def test_without_fcl_the_package_to_install_is_named(world, flyer, monkeypatch):
-    _fcl.fcl.cache_clear()
+    fcl.fcl.cache_clear()
     monkeypatch.setitem(sys.modules, "fcl", None)
     with pytest.raises(MissingDependencyError, match="pip install python-fcl"):
         make(world, flyer)
     monkeypatch.undo()
-    _fcl.fcl.cache_clear()
-    assert _fcl.fcl()
+    fcl.fcl.cache_clear()
+    assert fcl.fcl()
 
 
 def test_attached_objects_are_solids_like_any_other(world, flyer):

@@ -10,8 +10,13 @@ from oracles.checker_oracle import BallWorld, self_clearance, sphere_positions, 
 from oracles.random_robots import as_robot, random_arrays, random_q
 
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.collision._travel import edges_of, motion_bounds, sphere_jacobians
-from vprism_plan.collision.margins import max_safe_motion, min_clearance
+from vprism_plan.collision.motion import (
+    edges_of,
+    max_safe_motion,
+    min_clearance,
+    motion_bounds,
+    sphere_jacobians,
+)
 from vprism_plan.errors import RobotError
 
 SPACING = 0.03

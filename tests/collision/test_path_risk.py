@@ -18,9 +18,8 @@ from scipy.stats import binomtest
 import vprism_plan as vp
 from vprism_plan._kernels import checking as kernels
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.collision._counting import count_path
-from vprism_plan.collision._packing import pack_robot
-from vprism_plan.collision._risk_setting import grown
+from vprism_plan.collision.draws import count_path, grown
+from vprism_plan.collision.packing import pack_robot
 from vprism_plan.collision.risk import clopper_pearson, tolerated_hits
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.world import Box
@@ -105,7 +104,7 @@ def random_case(seed, world, **changes):
 
 def setting(checker):
     """The draws and the robot among them, without the margin."""
-    return checker._risk()._at
+    return checker.risk_setting()
 
 
 def swept(checker, path):

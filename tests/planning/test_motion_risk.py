@@ -62,7 +62,7 @@ def motions(checker):
 
 def steps_of(checker, qa, qb, spacing):
     """Samples of a motion, by what bounds the way of every sphere."""
-    from vprism_plan.collision._travel import motion_bounds
+    from vprism_plan.collision.motion import motion_bounds
 
     way = float(motion_bounds(checker.robot.arrays, (qb - qa)[None])[0][0])
     turned = float(np.abs(qb - qa).sum())

@@ -13,7 +13,7 @@ from oracles import kinematics_oracle as oracle
 from scipy.spatial.transform import Rotation
 
 from vprism_plan._kernels import checking
-from vprism_plan.collision._packing import pack_robot
+from vprism_plan.collision.packing import pack_robot
 from vprism_plan.robots import Robot
 from vprism_plan.robots.kinematics import frame_poses, place
 

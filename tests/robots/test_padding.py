@@ -15,7 +15,7 @@ from test_sphere_enclosure import gap, interior, spheres_of, surface
 
 from vprism_plan._kernels import checking
 from vprism_plan.collision import CollisionChecker, MeshChecker
-from vprism_plan.collision._packing import pack_robot
+from vprism_plan.collision.packing import pack_robot
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
 from vprism_plan.robots.changes import grown

@@ -246,13 +246,13 @@ def test_pair_gaps_agree_with_a_plain_count(robots):
 
 
 def test_the_second_opinion_takes_the_meshes_themselves(tmp_path):
-    from vprism_plan.collision._solids import robot_solids
+    from vprism_plan.collision.mesh.solids import robot_solids
 
     wedge().export(tmp_path / "w.stl")
     robot = Robot.from_urdf(urdf(tmp_path, "w.stl"), fit=QUICK)
     (solid,) = robot_solids(robot, "geometry", None)
     assert solid.shape.kind == "mesh"
-    assert solid.mesh is not None  # closed: its inside counts
+    assert solid.closed  # its inside counts
     np.testing.assert_allclose(
         np.ptp(solid.vertices, axis=0), np.ptp(in_link(wedge().vertices), axis=0), atol=1e-6
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import vprism_plan as vp
-from vprism_plan.collision._travel import edges_of
+from vprism_plan.collision.motion import edges_of
 from vprism_plan.trajopt import default_cost, optimize
 from vprism_plan.viz import save_figure, trajopt_figure
 

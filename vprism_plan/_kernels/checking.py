@@ -3,7 +3,7 @@
 
 A robot and a world reach these kernels as a few packed arrays, because every array
 argument costs a call about 60 ns and the whole state check takes about one
-microsecond. `vprism_plan.collision._packing` fills them:
+microsecond. `vprism_plan.collision.packing` fills them:
 
 the robot `rf`, `ri`: see `vprism_plan._kernels.robot`.
 

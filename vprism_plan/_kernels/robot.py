@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compiled kinematics: where the frames and the spheres of a packed robot are.
 
-`vprism_plan.collision._packing` fills the layout:
+`vprism_plan.collision.packing` fills the layout:
 
 robot floats `rf`, robot integers `ri`:
     ri[0:8]   = n_frames, n_spheres, n_links, n_pairs, dof, 0, 0, 0

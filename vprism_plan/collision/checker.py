@@ -11,27 +11,20 @@ from jaxtyping import Bool, Float
 
 from vprism_plan._kernels import checking as kernels
 from vprism_plan._threads import run_chunked
-from vprism_plan.collision import _explain
-from vprism_plan.collision._packing import pack_robot, pack_world
-from vprism_plan.collision._path_risk import PathRisk
-from vprism_plan.collision._queries import Queries
-from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.contacts import contact_rules
-from vprism_plan.collision.protocols import (
-    BakedWorld,
-    NodeField,
-    Numbers,
-    SphereRobot,
-)
-from vprism_plan.collision.reports import MotionReport, StateReport
-from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.robots.kinematics import joint_values
+from vprism_plan.collision import entropy, explain, margins, motion
+from vprism_plan.collision.config import CheckerConfig, contact_rules
+from vprism_plan.collision.draws import Setting
+from vprism_plan.collision.inputs import Numbers, configuration, configurations, waypoints
+from vprism_plan.collision.packing import PackedWorld, pack_robot, pack_world
+from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate, StateReport
+from vprism_plan.collision.risk import PathRisk
+from vprism_plan.errors import ConfigError
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 
 
-class CollisionChecker(Queries):
+class CollisionChecker:
     """Answers whether configurations and edges of a robot are free of a world.
 
     A configuration is valid when its joints are within their limits, every collision
@@ -50,40 +43,35 @@ class CollisionChecker(Queries):
     O(spheres) for the links whose bounding spheres come near something.
 
     Args:
-        world: What to avoid.
-        robot: Whose configurations are asked about.
+        world: What to avoid: a `vprism_plan.World`, or anything that has its `field` (origin,
+            spacing, distance and source at nodes), `planes`, `plane_names`, `sources`, `config`
+            (the policies `occluded` and `unobserved`), `map.occupancy(points)` and
+            `status(points)`. Contact rules and probabilities need a `World`.
+        robot: Whose configurations are asked about: a `vprism_plan.Robot`.
         config: Margins and tolerances.
     """
 
-    def __init__(
-        self, world: BakedWorld, robot: SphereRobot, config: CheckerConfig | None = None
-    ) -> None:
+    def __init__(self, world: Any, robot: Any, config: CheckerConfig | None = None) -> None:
         if hasattr(world, "for_base") and hasattr(robot, "base_pose"):
             world = world.for_base(robot.base_pose[:3, 3])
         self.world = world
         self.robot = robot
         self.config = CheckerConfig() if config is None else config
-        rules = contact_rules(robot, self.config.allowed_contacts)
-        self._rules, self._link_rules = rules
+        self._rules, self._link_rules = contact_rules(robot, self.config.allowed_contacts)
         packed = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
         self._rf, self._ri = packed.floats, packed.ints
         self._fields = [world.field]
         self._fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
-        baked = pack_world(world, self._fields, self.config.margin)
         # What `clearance` is measured to; verdicts are given by `_world`.
-        self._surfaces = baked.distance, baked.blocks, baked.floats
+        self._surfaces = pack_world(world, self._fields, self.config.margin)
         self._world = self._surfaces
-        self._dof = robot.dof
-        self._shape = (robot.dof,)
-        self._slides = bool((robot.arrays.kind == 2).any())
         self._lock = threading.Lock()
         self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
         self._levels: tuple[int, ...] = ()  # of `tightened`, in turn
         if self.config.max_risk is not None:
             self._bounded = self._risk()
-            self._fields, self._world = self._bounded.fields, self._bounded.packed
-            self._fields, self._world = self._within_what_was_seen()
+            self._fields, self._world = self._within_what_was_seen(self.config.max_risk)
         self._warm_up()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -94,9 +82,7 @@ class CollisionChecker(Queries):
         self.__dict__.update(state)
         self._lock = threading.Lock()
 
-    def _within_what_was_seen(
-        self,
-    ) -> tuple[list[NodeField], tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def _within_what_was_seen(self, bound: float) -> tuple[list[Any], PackedWorld]:
         """Return what verdicts under a bound on risk go by beside the draws.
 
         Touching a point that is occupied with at least the probability `level` breaks a bound
@@ -104,17 +90,16 @@ class CollisionChecker(Queries):
         inscribed in it: alone they let a planner shave millimetres off a surface that everybody
         sees. Under a bound above the level the seen surfaces alone are obstacles.
         """
-        world, bound = self._ruled_world(), self.config.max_risk
-        within = bound is not None and bound < world.config.level
+        world = self._ruled_world()
+        within = bound < world.config.level
         fields = [
             world.certain_field(ids, level_set=within, seen=not within) for ids in self._rules
         ]
-        baked = pack_world(world, fields, self.config.margin)
-        return fields, (baked.distance, baked.blocks, baked.floats)
+        return fields, pack_world(world, fields, self.config.margin)
 
     def _warm_up(self) -> None:
         """Ask every kernel once, so that none compiles inside a planner's time limit."""
-        q = np.zeros(self._dof)
+        q = np.zeros(self.robot.dof)
         self.is_valid_batch(q[None])
         self.is_valid_buffer(q)
         self.clearance(q)
@@ -134,30 +119,26 @@ class CollisionChecker(Queries):
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        return self.is_valid_buffer(self._configuration(q))
+        return self.is_valid_buffer(configuration(self.robot, q))
 
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
         """`is_valid` without looking at the shape: q must be a contiguous float64 (dof,) array.
 
         The path for planners' inner loops.
         """
-        if self._bounded is None:
-            return kernels.is_valid(q, self._rf, self._ri, *self._world)
-        return (
-            kernels.is_valid(q, self._rf, self._ri, *self._world)
-            and self._bounded.hits_at(q) <= self._bounded.allowed
-        )
+        free = kernels.is_valid(q, self._rf, self._ri, *self._world)
+        return free and (self._bounded is None or self._bounded.accepts_one(q))
 
     def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
         """Return `is_valid` for each row of Q (n, dof); runs on all worker threads."""
-        Q = self._configurations(Q)
+        Q = configurations(self.robot, Q)
         out = np.empty(len(Q), dtype=np.bool_)
 
         def work(part: slice) -> None:
             kernels.is_valid_batch(Q[part], self._rf, self._ri, *self._world, out[part])
             if self._bounded is not None:
                 left = part.start + np.flatnonzero(out[part])
-                out[left] = self._bounded.hits_each(Q[left]) <= self._bounded.allowed
+                out[left] = self._bounded.accepts_each(Q[left])
 
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return out
@@ -174,7 +155,7 @@ class CollisionChecker(Queries):
         Raises:
             RobotError: q does not have shape (dof,) or is not finite.
         """
-        return float(self._clearances(self._configuration(q)[None])[0][0])
+        return float(self._clearances(configuration(self.robot, q)[None])[0][0])
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return `clearance` for each row of Q (n, dof), metres."""
@@ -198,7 +179,8 @@ class CollisionChecker(Queries):
         Raises:
             RobotError: An end does not have shape (dof,).
         """
-        return self.check_motion_buffer(self._configuration(qa), self._configuration(qb))
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
+        return self.check_motion_buffer(qa, qb)
 
     def check_motion_buffer(
         self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
@@ -208,7 +190,7 @@ class CollisionChecker(Queries):
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
         """Return the verdict on an edge with its tolerance and, when refused, the reason."""
-        qa, qb = self._configuration(qa), self._configuration(qb)
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
         stats = np.empty(4)
         valid = self._check_motion(qa, qb, stats)
         fraction: float | None = None
@@ -269,15 +251,14 @@ class CollisionChecker(Queries):
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        return _explain.explain(self, self._configuration(q))
+        return explain.explain(self, configuration(self.robot, q))
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is usable but odd about the world and the robot; every verdict carries it."""
-        found = (*getattr(self.world, "warnings", ()), *getattr(self.robot, "warnings", ()))
-        return tuple(dict.fromkeys(found))
+        return explain.warnings_of(self.world, self.robot)
 
-    def verdict_field(self, link: int) -> NodeField:
+    def verdict_field(self, link: int) -> Any:
         """Return the distance field that verdicts check a link (index) against."""
         return self._fields[int(self._link_rules[link])]
 
@@ -311,17 +292,10 @@ class CollisionChecker(Queries):
         free = kernels.check_motion(
             qa, qb, self._rf, self._ri, *self._world, self.config.min_motion, stats
         )
-        if not free or self._bounded is None:
-            return free
-        return self._bounded.hits(np.stack([qa, qb])) <= self._bounded.allowed
+        return free and (self._bounded is None or self._bounded.accepts(np.stack([qa, qb])))
 
     def _clearances(self, Q: Numbers) -> tuple[np.ndarray, np.ndarray]:
-        Q = self._configurations(Q)
-        if not np.isfinite(Q).all():
-            row = int(np.flatnonzero(~np.isfinite(Q).all(axis=1))[0])
-            raise RobotError(
-                f"configuration {row} is {Q[row].tolist()}; clearance needs finite joint values"
-            )
+        Q = configurations(self.robot, Q, finite=True)
         world, own = np.empty(len(Q)), np.empty(len(Q))
 
         def work(part: slice) -> None:
@@ -332,20 +306,64 @@ class CollisionChecker(Queries):
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return world, own
 
-    def _configuration(self, q: Numbers) -> Float[np.ndarray, "dof"]:
-        array = joint_values(q, self.robot, "a configuration")
-        if array.shape != self._shape:
-            raise RobotError(
-                f"configuration has shape {array.shape}; {self.robot.name} needs ({self._dof},): "
-                f"{', '.join(self.robot.joint_names)}"
-            )
-        return array
+    # --- margins ---------------------------------------------------------------------------
 
-    def _configurations(self, Q: Numbers) -> Float[np.ndarray, "n dof"]:
-        array = joint_values(Q, self.robot, "configurations")
-        if array.ndim != 2 or array.shape[1] != self._dof:
-            raise RobotError(
-                f"configurations have shape {array.shape}; {self.robot.name} needs "
-                f"(n, {self._dof}): {', '.join(self.robot.joint_names)}"
+    safety_margin = margins.safety_margin
+    min_clearance = motion.min_clearance
+    max_safe_motion = motion.max_safe_motion
+    path_entropy = entropy.path_entropy
+
+    # --- risk --------------------------------------------------------------------------
+    @property
+    def max_risk(self) -> float | None:
+        """Bound on the probability of collision of what is valid, or None."""
+        return self.config.max_risk
+
+    def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
+        """Return the probability that a path (or a configuration) touches anything.
+
+        The share of worlds, drawn from the map's posterior, in which any sphere of any
+        moving link touches an occupied voxel that it may not touch, or a certain obstacle,
+        anywhere on the path: the same world for the whole path. Edges are straight in joint
+        space and swept without gaps. Margin, self-collision and joint limits do not enter.
+
+        Args:
+            path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
+            held_out: ask other worlds than those that `max_risk` is checked with. A path
+                that a planner found with this checker was selected by the worlds it was
+                checked with, so their verdict on it is too mild.
+
+        Raises:
+            RobotError: a wrong shape, a value that is not finite, or a prismatic joint
+                outside its limits (no bound on the motion holds there).
+        """
+        rows = waypoints(self.robot, path, single=True)
+        risk = self._risk()
+        return (risk.held_out() if held_out else risk).estimate(rows)
+
+    def _ruled_world(self) -> Any:
+        if not hasattr(self.world, "certain_field"):
+            raise ConfigError(
+                f"probabilities and allowed contacts need a vprism_plan.World; "
+                f"{type(self.world).__name__} has no posterior and no fields per object"
             )
-        return array
+        return self.world
+
+    def _risk(self) -> PathRisk:
+        with self._lock:
+            if self._path_risk is None:
+                self._path_risk = PathRisk(
+                    self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
+                )
+            return self._path_risk
+
+    def risk_setting(self) -> Setting:
+        """Return what probabilities are counted with, for planners' objectives."""
+        return self._risk().setting
+
+    def risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
+        """Return what makes a configuration too risky; empty if it is not, or has no bound."""
+        bounded = self._bounded
+        if bounded is None or bounded.accepts_one(q):
+            return ()
+        return bounded.contacts(q)

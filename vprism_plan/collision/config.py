@@ -1,14 +1,30 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What "free" means for one checker."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from vprism_plan._numbers import is_number, is_whole
 from vprism_plan.errors import ConfigError
+
+# What each number must be, in words and as a test that nan fails.
+_LENGTH = "finite and at least 0 metres", lambda v: 0.0 <= v < np.inf
+_NUMBERS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "margin": _LENGTH,
+    "self_margin": _LENGTH,
+    "min_motion": ("finite and at least 1e-5 metres", lambda v: 1e-5 <= v < np.inf),
+    "max_risk": (
+        "a probability strictly between 0 and 1, or None for no bound",
+        lambda v: 0.0 < v < 1.0,
+    ),
+    "n_worlds": ("a positive multiple of 64", lambda v: v >= 64 and v % 64 == 0),
+    "risk_seed": ("at least 0", lambda v: v >= 0),
+    "confidence": ("strictly between 0 and 1", lambda v: 0.0 < v < 1.0),
+}
 
 
 @dataclass(frozen=True)
@@ -49,37 +65,17 @@ class CheckerConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that would make a verdict meaningless."""
-        for name in ("margin", "self_margin", "min_motion", "max_risk", "confidence"):
+        for name, (wanted, fits) in _NUMBERS.items():
             value = getattr(self, name)
-            if not (is_number(value) or (name == "max_risk" and value is None)):
-                raise ConfigError(f"{name} is {value!r}; it must be a number")
-        for name in ("n_worlds", "risk_seed"):
-            value = getattr(self, name)
-            if not is_whole(value):
-                raise ConfigError(f"{name} is {value!r}; it must be a whole number")
-        for name in ("margin", "self_margin"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0.0):
-                raise ConfigError(f"{name} is {value!r}; it must be finite and at least 0 metres")
-        if not (np.isfinite(self.min_motion) and self.min_motion >= 1e-5):
-            raise ConfigError(
-                f"min_motion is {self.min_motion!r}; it must be finite and at least 1e-5 metres"
-            )
-        if self.max_risk is not None and not 0.0 < self.max_risk < 1.0:
-            raise ConfigError(
-                f"max_risk is {self.max_risk!r}; it must be a probability strictly between 0 "
-                "and 1, or None for no bound"
-            )
-        if self.n_worlds < 64 or self.n_worlds % 64:
-            raise ConfigError(
-                f"n_worlds is {self.n_worlds!r}; it must be a positive multiple of 64"
-            )
-        if self.risk_seed < 0:
-            raise ConfigError(f"risk_seed is {self.risk_seed!r}; it must be at least 0")
-        if not 0.0 < self.confidence < 1.0:
-            raise ConfigError(
-                f"confidence is {self.confidence!r}; it must be strictly between 0 and 1"
-            )
+            if name == "max_risk" and value is None:
+                continue
+            whole = name in {"n_worlds", "risk_seed"}
+            if not (is_whole(value) if whole else is_number(value)):
+                raise ConfigError(
+                    f"{name} is {value!r}; it must be a {'whole ' if whole else ''}number"
+                )
+            if not fits(value):
+                raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
         object.__setattr__(self, "allowed_contacts", _checked_contacts(self.allowed_contacts))
 
     @property
@@ -97,13 +93,43 @@ def _checked_contacts(contacts: Any) -> dict[str, frozenset[int]]:
         )
     checked = {}
     for name, ids in contacts.items():
-        whole = isinstance(ids, Collection) and not isinstance(ids, str)
-        if not (
-            whole and all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in ids)
-        ):
+        some = isinstance(ids, Collection) and not isinstance(ids, str)
+        if not (some and all(is_whole(i) for i in ids)):
             raise ConfigError(
                 f"allowed_contacts[{name!r}] is {ids!r}; it must be a set of object ids (whole "
                 "numbers), for example {3}"
             )
         checked[str(name)] = frozenset(int(i) for i in ids)
     return checked
+
+
+def contact_rules(
+    robot: Any, allowed: Mapping[str, Collection[int]]
+) -> tuple[list[frozenset[int]], Int[np.ndarray, " links"]]:
+    """Turn allowed contacts into distinct rules.
+
+    Args:
+        robot: whose links and groups are named: has `link_names`, and `links_of(name)` as
+            `vprism_plan.robots.Robot` does.
+        allowed: link or SRDF group -> ids of the objects it may touch; what several
+            entries say of one link adds up.
+
+    Returns:
+        The sets of objects that may be touched, the empty one first, and the index of the
+        set that holds for each link.
+
+    Raises:
+        RobotError: no such link or group.
+    """
+    names = list(robot.link_names)
+    per_link: list[set[int]] = [set() for _ in names]
+    for name, ids in allowed.items():
+        for link in robot.links_of(name):
+            per_link[names.index(link)].update(int(i) for i in ids)
+    rules = [frozenset[int]()]
+    index = np.zeros(len(names), dtype=np.int64)
+    for number, own in enumerate(map(frozenset, per_link)):
+        if own not in rules:
+            rules.append(own)
+        index[number] = rules.index(own)
+    return rules, index

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.collision._travel import edges_of, place_points
-from vprism_plan.collision.protocols import Numbers
+from vprism_plan.collision.inputs import Numbers
+from vprism_plan.collision.motion import edges_of, place_points
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.kinematics import frame_poses, joint_values
+from vprism_plan.robots.kinematics import frame_poses
 
 _POINTS = 64  # per sphere and waypoint
 _MAX_CELLS = 200_000_000
@@ -67,13 +67,13 @@ class PathEntropy:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values; null where nothing is supported."""
-        plain: dict[str, Any] = {}
-        for name, value in self.__dict__.items():
+
+        def plain(value: Any) -> Any:
             if isinstance(value, tuple):
-                plain[name] = [None if np.isnan(v) else v for v in value]
-            else:
-                plain[name] = None if isinstance(value, float) and np.isnan(value) else value
-        return plain
+                return [plain(v) for v in value]
+            return None if np.isnan(value) else value
+
+        return {name: plain(value) for name, value in vars(self).items()}
 
 
 def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> PathEntropy:
@@ -96,8 +96,7 @@ def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> 
     """
     if not (np.isfinite(resolution) and resolution > 0.0):
         raise RobotError(f"resolution is {resolution!r}; it must be positive and finite (metres)")
-    array = joint_values(q_or_path, checker.robot, "a path")
-    edges = edges_of(checker, array[None] if array.ndim == 1 else array)
+    edges = edges_of(checker, q_or_path, single=True)
     Q, _ = edges.samples(0.25 * resolution)
     mean, most, unsupported, asked = _at_waypoints(checker, edges.path)
     voxels = swept_voxels(checker, Q, resolution)

@@ -2,41 +2,236 @@
 """How far every link is from every obstacle, and which way leads out."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision._bodies import Body, bodies_of
-from vprism_plan.collision._travel import (
-    checked_tolerance,
-    edges_of,
-    joint_units,
-    place_points,
-    sphere_jacobians,
-)
-from vprism_plan.collision.margin_reports import BodyMargin, SafetyMargins
-from vprism_plan.collision.path_margins import (
-    PathClearance,
-    SafeMotion,
-    max_safe_motion,
-    min_clearance,
-)
-from vprism_plan.collision.protocols import Numbers
+from vprism_plan.collision.inputs import Numbers, checked_tolerance, configurations
+from vprism_plan.collision.motion import edges_of, joint_units, place_points, sphere_jacobians
+from vprism_plan.collision.reports import SPOKEN, Kind, kind_of
+from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses, joint_values
-
-__all__ = [
-    "BodyMargin",
-    "PathClearance",
-    "SafeMotion",
-    "SafetyMargins",
-    "margin_profile",
-    "max_safe_motion",
-    "min_clearance",
-    "safety_margin",
-]
+from vprism_plan.world.distance import DistanceField
+from vprism_plan.world.source_fields import source_field
 
 _CHUNK = 512  # configurations whose spheres are in memory at once
+
+
+@dataclass(frozen=True)
+class BodyMargin:
+    """Where one link and one obstacle are nearest to each other.
+
+    Attributes:
+        link: the link.
+        body: the obstacle, named as in `Contact.body`.
+        kind: what it is.
+        clearance: lower bound of the distance between them, metres; negative inside.
+            Along a path: over all of it, edges included.
+        gradient: (dof,) change of the distance per radian or metre of each joint, at the
+            configuration where they are nearest, from the slope of the distance field;
+            zeros where that has none (in the middle of an obstacle).
+        nearest: point of the obstacle nearest to the sphere's centre, world, metres, to
+            within a voxel of the world's field (exact for half-spaces; rough from beyond
+            the grid). From a centre inside the obstacle: the nearest way out.
+        witness: point of the link's surface nearest to it, world, metres.
+        sphere: the link's collision sphere on which `witness` lies.
+        occupancy: the map's P(occupied) at `nearest`; None where the map has no say
+            (support surface, known geometry).
+        entropy: the map's entropy there, nats; None likewise.
+        allowed: whether a contact rule lets this link touch this object.
+        place: where on the path: number of the edge plus the fraction of it; 0 for a
+            single configuration.
+    """
+
+    link: str
+    body: str
+    kind: Kind
+    clearance: float
+    gradient: tuple[float, ...]
+    nearest: tuple[float, float, float]
+    witness: tuple[float, float, float]
+    sphere: int
+    occupancy: float | None
+    entropy: float | None
+    allowed: bool = False
+    place: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class SafetyMargins:
+    """Answer of `safety_margin`: every moving link against every obstacle.
+
+    Attributes:
+        margins: one per link and obstacle, nearest first.
+        clearance: lower bound of the distance to all of them that count, metres (that of
+            `CollisionChecker.clearance`; contacts that a rule allows do not count).
+        self_clearance: lower bound of the gap between links that may collide, metres.
+        margin: clearance that the checker requires, metres.
+        joint_names: names of the gradients' entries.
+        joint_units: their units, "rad" or "m".
+        resolution: voxel of the world's field, metres: how exact `nearest` is.
+        tolerance: what was subtracted, metres, so that the bounds hold between the
+            configurations that were looked at; 0 for a single one.
+        configurations: how many that were.
+    """
+
+    margins: tuple[BodyMargin, ...]
+    clearance: float
+    self_clearance: float
+    margin: float
+    joint_names: tuple[str, ...]
+    joint_units: tuple[str, ...]
+    resolution: float
+    tolerance: float
+    configurations: int
+
+    def between(self, link: str, body: str) -> BodyMargin:
+        """Return the margin of one link and one obstacle.
+
+        Raises:
+            RobotError: there is none; the message lists what there is.
+        """
+        for margin in self.margins:
+            if (margin.link, margin.body) == (link, body):
+                return margin
+        links = ", ".join(dict.fromkeys(m.link for m in self.margins))
+        raise RobotError(
+            f"no margin between {link!r} and {body!r}; links that move: {links}; "
+            f"obstacles: {', '.join(self.of_bodies())}"
+        )
+
+    def of_bodies(self) -> dict[str, BodyMargin]:
+        """Return the smallest margin of each obstacle, nearest first."""
+        nearest: dict[str, BodyMargin] = {}
+        for margin in self.margins:
+            nearest.setdefault(margin.body, margin)
+        return nearest
+
+    def text(self, rows: int = 10) -> str:
+        """Return the nearest pairs as a table: clearance, P(occupied), entropy, steepest joint."""
+        table: list[tuple[str, ...]] = [
+            ("link", "body", "clearance", "P(occ)", "entropy", "steepest joint")
+        ]
+        table += [self._row(margin) for margin in self.margins[:rows]]
+        a, b, c, d, e, _ = (max(map(len, column)) for column in zip(*table, strict=True))
+        shape = f"{{:{a}}}  {{:{b}}}  {{:>{c}}}  {{:>{d}}}  {{:>{e}}}  {{}}"
+        lines = [shape.format(*row).rstrip() for row in table]
+        if len(self.margins) > rows:
+            lines.append(f"and {len(self.margins) - rows} farther pairs")
+        return "\n".join(lines)
+
+    def _row(self, margin: BodyMargin) -> tuple[str, ...]:
+        steepest = int(np.argmax(np.abs(margin.gradient)))
+        slope = 1000 * margin.gradient[steepest]
+        joint = f"{self.joint_names[steepest]} {slope:+.0f} mm/{self.joint_units[steepest]}"
+        unseen = margin.kind in {"occluded", "unobserved"}
+        body = SPOKEN[margin.body] if unseen else margin.body
+        return (
+            margin.link,
+            body + (" (allowed)" if margin.allowed else ""),
+            f"{1000 * margin.clearance:.1f} mm",
+            "-" if margin.occupancy is None else f"{margin.occupancy:.2f}",
+            "-" if margin.entropy is None else f"{margin.entropy:.2f}",
+            joint if abs(slope) >= 0.5 else "-",
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return {**self.__dict__, "margins": [margin.to_dict() for margin in self.margins]}
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacle:
+    """One obstacle.
+
+    Attributes:
+        name: "object:3", "support surface", "background", "occluded", "unobserved" or
+            "known:NAME".
+        kind: what it is.
+        plane: (4,) normal and offset of a half-space, else None.
+        field: distances to everything else, else None.
+    """
+
+    name: str
+    kind: Kind
+    plane: Any = None
+    field: DistanceField | None = None
+
+    def bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Lower bound of the signed distance from points (world, metres); exact for planes."""
+        if self.field is None:
+            return np.asarray(points @ self.plane[:3] - self.plane[3])
+        return self.field.lower_bound(points)
+
+    def nearest(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Nearest points of the obstacle (of what is not the obstacle, from inside it), and
+        the unit directions in which the distance grows (0 where it has no slope).
+
+        One step down the slope of the nodes' distances, to within a voxel; from beyond the
+        grid, the nearest as seen from the grid's face. Directions are within a degree for
+        most points, a few degrees off within a voxel of an edge.
+        """
+        if self.field is None:
+            normal = np.tile(self.plane[:3], (len(points), 1))
+            return points - self.bound(points)[:, None] * normal, normal
+        inside = points
+        if not self.field.solid_outside:
+            inside = np.clip(points, self.field.origin, self.field.upper)
+        distance, normal = _slope(self.field, inside)
+        # Not nearer than is proven: the interpolated distance can be a voxel off.
+        found = inside - np.maximum(distance, self.bound(inside))[:, None] * normal
+        beyond = (inside != points).any(axis=1)
+        away = points[beyond] - found[beyond]
+        normal[beyond] = away / np.linalg.norm(away, axis=1, keepdims=True)
+        return found, normal
+
+
+def _slope(
+    field: DistanceField, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Interpolated distance and its unit slope, from differences over one voxel.
+
+    Over a voxel, because the slope of a trilinear interpolation itself is constant along
+    each axis of a cell: off a ball it errs by three degrees, these by less than one.
+    """
+    import torch
+
+    half = 0.5 * field.spacing
+    steps = np.concatenate([np.zeros((1, 3)), half * np.eye(3), -half * np.eye(3)])
+    asked = points + steps[:, None]
+    if not field.solid_outside:  # beyond the faces distances are bounds, not distances
+        asked[1:] = np.clip(asked[1:], field.origin, field.upper)
+    with torch.no_grad():
+        around = field.distance_at(torch.from_numpy(asked)).numpy()
+    apart = np.stack([asked[1 + k, :, k] - asked[4 + k, :, k] for k in range(3)], axis=1)
+    gradient = (around[1:4] - around[4:7]).T / apart
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    return around[0], np.where(length > 0, gradient / np.where(length > 0, length, 1.0), 0.0)
+
+
+def obstacles_of(world: Any, without: frozenset[int] = frozenset()) -> tuple[Obstacle, ...]:
+    """All obstacles of a `World`: half-spaces, then `world.sources` in order.
+
+    Objects `without` may be touched: occluded space inside them goes. Fields are baked on first
+    use: about half a second each for a table top at 1 cm, 6 bytes per node while the world lives.
+    """
+    found = [
+        Obstacle(name, kind_of(name), plane=row)
+        for name, row in zip(world.plane_names, world.planes, strict=True)
+    ]
+    for name in world.sources:
+        field = source_field(world, name, without)
+        if field.source.flat[0] >= 0:
+            found.append(Obstacle(name, kind_of(name), field=field))
+    return tuple(found)
 
 
 def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) -> SafetyMargins:
@@ -49,7 +244,7 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
     subtracted; for a tight bound over everything ask `min_clearance`. Joint limits do
     not enter.
 
-    The first call bakes one distance field per obstacle (`_bodies.bodies_of`); after
+    The first call bakes one distance field per obstacle (`obstacles_of`); after
     that a configuration costs milliseconds, a path O(configurations x spheres x bodies).
 
     Args:
@@ -64,8 +259,8 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
     checked_tolerance(tolerance)
     array = joint_values(q_or_path, checker.robot, "a path")
     if array.ndim == 1:
-        checker.clearance(array)  # refuses what is not a configuration
-        Q, places, slack = array[None], np.zeros(1), 0.0
+        Q = configurations(checker.robot, array[None], finite=True)
+        places, slack = np.zeros(1), 0.0
     else:
         edges = edges_of(checker, array)
         (Q, places), slack = edges.samples(tolerance), tolerance if len(array) > 1 else 0.0
@@ -106,7 +301,7 @@ def margin_profile(
     Q, places = edges_of(checker, path).samples(tolerance)
     profile: dict[str, np.ndarray] = {}
     for rule, links in _rules(checker):
-        bodies = [b for b in bodies_of(checker.world, rule) if not _is_allowed(b, rule)]
+        bodies = [b for b in obstacles_of(checker.world, rule) if not _is_allowed(b, rule)]
         for rows, number, bound, _ in _scan(checker, Q, bodies, links):
             name = bodies[number].name
             part = profile.setdefault(name, np.full(len(Q), np.inf))[rows]
@@ -123,14 +318,14 @@ def _rules(checker: Any) -> Iterator[tuple[frozenset[int], Int[np.ndarray, " l"]
         yield rule, np.array(links)
 
 
-def _is_allowed(body: Body, rule: frozenset[int]) -> bool:
+def _is_allowed(body: Obstacle, rule: frozenset[int]) -> bool:
     return body.kind == "object" and int(body.name.split(":")[1]) in rule
 
 
 def _scan(
     checker: Any,
     Q: Float[np.ndarray, "n dof"],
-    bodies: Sequence[Body],
+    bodies: Sequence[Obstacle],
     links: Int[np.ndarray, " l"],
 ) -> Iterator[tuple[slice, int, Float[np.ndarray, "m l"], Int[np.ndarray, "m l"]]]:
     """Yield, per piece of Q and number of a body, each link's bound and the sphere that has it.
@@ -165,7 +360,7 @@ def _nearest_pairs(
     checker: Any, Q: Float[np.ndarray, "n dof"], places: Float[np.ndarray, " n"], slack: float
 ) -> Iterator[BodyMargin]:
     for rule, links in _rules(checker):
-        bodies = bodies_of(checker.world, rule)
+        bodies = obstacles_of(checker.world, rule)
         shape = (len(bodies), len(links))
         best, row = np.full(shape, np.inf), np.zeros(shape, dtype=np.int64)
         sphere = np.zeros(shape, dtype=np.int64)
@@ -192,10 +387,7 @@ def _nearest_pairs(
 
 
 def _details(
-    checker: Any,
-    Q: Float[np.ndarray, "l dof"],
-    body: Body,
-    spheres: Int[np.ndarray, " l"],
+    checker: Any, Q: Float[np.ndarray, "l dof"], body: Obstacle, spheres: Int[np.ndarray, " l"]
 ) -> list[dict[str, Any]]:
     """Slope, nearest points and what the map says there, for one sphere at each configuration."""
     arrays = checker.robot.arrays
@@ -205,16 +397,9 @@ def _details(
     gradient = np.einsum("nk,nkj->nj", normal, jacobians)
     occupancy: list[float | None] = [None] * len(Q)
     entropy: list[float | None] = [None] * len(Q)
-    if body.of_map:
+    if body.kind not in {"support", "known"}:  # of those the map has nothing to say
         occupancy = checker.world.map.occupancy(nearest).tolist()
         entropy = checker.world.map.entropy(nearest).tolist()
-    return [
-        {
-            "gradient": tuple(gradient[i].tolist()),
-            "nearest": tuple(nearest[i].tolist()),
-            "witness": tuple(witness[i].tolist()),
-            "occupancy": occupancy[i],
-            "entropy": entropy[i],
-        }
-        for i in range(len(Q))
-    ]
+    names = "gradient", "nearest", "witness", "occupancy", "entropy"
+    columns = (*(map(tuple, a.tolist()) for a in (gradient, nearest, witness)), occupancy, entropy)
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]

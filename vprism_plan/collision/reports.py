@@ -1,33 +1,43 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Verdicts with reasons. Keys of the dictionaries mirror MoveIt's messages."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal
 
-from vprism_plan.collision.risk import RiskEstimate
+import numpy as np
+from jaxtyping import Float
 
 Kind = Literal[
-    "object",
-    "support",
-    "background",
-    "occluded",
-    "unobserved",
-    "known",
-    "risk",
-    "self",
-    "joint_limit",
-    "not_finite",
-]
+    "object", "support", "background", "occluded", "unobserved", "known",
+    "risk", "self", "joint_limit", "not_finite",
+]  # fmt: skip
+
+Point = tuple[float, float, float]
 
 # How a reason names what is no thing.
-_SPOKEN = {
+SPOKEN = {
     "background": "unlabelled clutter",
     "occluded": "occluded space",
     "support surface": "the support surface",
     "unobserved": "unobserved space",
 }
-# moveit_msgs/ContactInformation body types
-_ROBOT_LINK, _WORLD_OBJECT = 0, 1
+_ROBOT_LINK, _WORLD_OBJECT = 0, 1  # moveit_msgs/ContactInformation body types
+
+
+def kind_of(name: str) -> Kind:
+    """Return what the name of a source stands for."""
+    if name == "support surface":
+        return "support"
+    lead: Any = name.split(":", 1)[0]
+    return lead if lead in {"object", "background", "occluded", "unobserved"} else "known"
+
+
+def as_point(values: Float[np.ndarray, "3"]) -> Point:
+    """Return three numbers as a tuple."""
+    x, y, z = (float(v) for v in values)
+    return x, y, z
 
 
 @dataclass(frozen=True)
@@ -58,8 +68,8 @@ class Contact:
     body: str
     depth: float
     sphere: int = -1
-    position: tuple[float, float, float] | None = None
-    normal: tuple[float, float, float] | None = None
+    position: Point | None = None
+    normal: Point | None = None
     probability: float | None = None
     detail: str = ""
     required: float = 0.0
@@ -73,12 +83,10 @@ class Contact:
                 f"{self.link} touches {self.body} with probability {self.probability:.2f} "
                 f"({self.detail})"
             )
-        at = ""
-        if self.position is not None:
-            at = " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
+        at = "" if not self.position else " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
         sure = "" if self.probability is None else f", P(occupied) {self.probability:.2f}"
         why = f" ({self.detail})" if self.detail else ""
-        body = _SPOKEN.get(self.body, self.body)
+        body = SPOKEN.get(self.body, self.body)
         way = f"{1000 * abs(self.required - self.depth):.1f}"
         if way == "0.0":
             return f"{self.link} touches {body}{at}{sure}{why}"
@@ -94,14 +102,7 @@ class Contact:
             "body_type_1": _ROBOT_LINK,
             "contact_body_2": self.body,
             "body_type_2": _ROBOT_LINK if self.kind == "self" else _WORLD_OBJECT,
-            "position": self.position,
-            "normal": self.normal,
-            "depth": self.depth,
-            "required": self.required,
-            "kind": self.kind,
-            "sphere": self.sphere,
-            "probability": self.probability,
-            "detail": self.detail,
+            **{name: vars(self)[name] for name in vars(self) if name not in {"link", "body"}},
         }
 
 
@@ -149,20 +150,127 @@ class StateReport:
         """Return JSON-ready keys of moveit_msgs/GetStateValidity (valid, contacts,
         cost_sources), and ours. A cost source's cost is the map's P(occupied)."""
         return {
-            "valid": self.valid,
+            **vars(self),
             "contacts": [contact.to_dict() for contact in self.contacts],
             "cost_sources": [
                 {"cost_density": c.probability, "aabb_center": c.position, "contact_body": c.body}
                 for c in self.contacts
                 if c.probability is not None
             ],
-            "clearance": self.clearance,
-            "self_clearance": self.self_clearance,
-            "margin": self.margin,
             "shares": dict(self.shares),
             "policies": dict(self.policies),
             "allowed": [contact.to_dict() for contact in self.allowed],
             "warnings": list(self.warnings),
+        }
+
+
+@dataclass(frozen=True)
+class FirstContact:
+    """What a path touches first, in some of the worlds where it touches anything.
+
+    Attributes:
+        body: "object:3", "background", "occluded", "support surface", ...
+        link: link that touches it.
+        waypoint: index of the waypoint where, or after which, it does.
+        share: share of the colliding worlds; the shares of all causes sum to 1.
+    """
+
+    body: str
+    link: str
+    waypoint: int
+    share: float
+
+    def text(self) -> str:
+        """Return the cause as one phrase."""
+        return (
+            f"{self.link} touches {self.body} at or after waypoint {self.waypoint} in "
+            f"{100 * self.share:.0f}% of them"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RiskEstimate:
+    """The joint probability that a path collides, over worlds drawn from the posterior.
+
+    Attributes:
+        probability: share of the worlds in which any sphere touches anything anywhere on
+            the path; the same world for the whole path. A voxel counts as the ball inside
+            it. 1 if a certain obstacle is hit.
+        lower: Clopper-Pearson bound of the worlds that occupy a voxel's centre inside a
+            sphere, less what skipping certain voxels may add.
+        upper: Clopper-Pearson bound of the worlds with a voxel whose corners a sphere reaches,
+            and what skipping certain voxels may hide; above 0 even if no world collides.
+            Verdicts with `max_risk` go by it.
+        confidence: of the interval (lower, upper), two-sided; it holds the size of voxels.
+        n_worlds: worlds drawn.
+        seed: of the draws.
+        per_waypoint: (T,) the same probability at each waypoint alone.
+        certain: whether the path hits what is an obstacle in every world: support surface,
+            background, unseen space by policy, known geometry.
+        spacing: no sphere centre moves more than this between two samples, metres; what
+            lies between samples is covered by growing the spheres.
+        configurations: samples taken.
+        trace, volume: find `first_contact` and `shares`, which cost more than the rest and
+            are often not asked for.
+    """
+
+    probability: float
+    lower: float
+    upper: float
+    confidence: float
+    n_worlds: int
+    seed: int
+    per_waypoint: Float[np.ndarray, " t"]
+    certain: bool
+    spacing: float
+    configurations: int
+    trace: Callable[[], tuple[FirstContact, ...]] = field(repr=False)
+    volume: Callable[[], dict[str, float]] = field(repr=False)
+
+    @cached_property
+    def first_contact(self) -> tuple[FirstContact, ...]:
+        """What the worlds collide with first: causes, the most frequent first; empty if no
+        world collides."""
+        return self.trace()
+
+    @cached_property
+    def shares(self) -> dict[str, float]:
+        """Share of the swept volume that the map cannot judge, by kind: "occluded" (hidden,
+        without support), "unobserved", "outside" (the grid)."""
+        return self.volume()
+
+    @property
+    def unsupported_share(self) -> float:
+        """Share of the swept volume in space that the map cannot judge."""
+        return sum(self.shares.values())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Find what is left to find before the estimate leaves the process."""
+        found = {"first_contact": self.first_contact, "shares": self.shares}
+        return {**self.__dict__, **found, "trace": tuple, "volume": dict}
+
+    def text(self) -> str:
+        """Return the estimate in one line."""
+        line = (
+            f"P(collision) {self.probability:.3f} "
+            f"({100 * self.confidence:.0f}% interval {self.lower:.3f} to {self.upper:.3f}, "
+            f"{self.n_worlds} worlds)"
+        )
+        if self.first_contact:
+            line += f"; {self.first_contact[0].text()}"
+        if self.unsupported_share > 0.005:
+            line += f"; {100 * self.unsupported_share:.0f}% of the swept volume is not judged"
+        return line
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready keys."""
+        found = {name: value for name, value in vars(self).items() if not callable(value)}
+        return {
+            **found,
+            "per_waypoint": [float(p) for p in self.per_waypoint],
+            "first_contact": [vars(cause) for cause in self.first_contact],
+            "unsupported_share": self.unsupported_share,
+            "shares": dict(self.shares),
         }
 
 

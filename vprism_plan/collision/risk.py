@@ -1,132 +1,208 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The probability that a path touches anything, with its interval and its causes."""
+"""The probability that a robot collides: verdicts by a bound on it, and estimates of it."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
+import copy
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.special import betaincinv
 
+from vprism_plan._kernels import checking
+from vprism_plan._kernels import risk as kernels
+from vprism_plan.collision import draws
+from vprism_plan.collision.config import CheckerConfig
+from vprism_plan.collision.reports import Contact, RiskEstimate
 from vprism_plan.errors import ConfigError
 
-
-@dataclass(frozen=True)
-class FirstContact:
-    """What a path touches first, in some of the worlds where it touches anything.
-
-    Attributes:
-        body: "object:3", "background", "occluded", "support surface", ...
-        link: link that touches it.
-        waypoint: index of the waypoint where, or after which, it does.
-        share: share of the colliding worlds; the shares of all causes sum to 1.
-    """
-
-    body: str
-    link: str
-    waypoint: int
-    share: float
-
-    def text(self) -> str:
-        """Return the cause as one phrase."""
-        return (
-            f"{self.link} touches {self.body} at or after waypoint {self.waypoint} in "
-            f"{100 * self.share:.0f}% of them"
-        )
+_HELD_OUT = 1_000_003  # added to the seed of the draws
+_ONE = np.zeros(1, np.int64)
+_MAX_SAMPLES = 64
+_SLAB = 8  # planes of nodes classified at once
 
 
-@dataclass(frozen=True, eq=False)
-class RiskEstimate:
-    """The joint probability that a path collides, over worlds drawn from the posterior.
+class PathRisk:
+    """A robot among the posterior worlds of one map; see `make_setting` for the arguments.
 
     Attributes:
-        probability: share of the worlds in which any sphere touches anything anywhere on
-            the path; the same world for the whole path. A voxel counts as the ball inside
-            it. 1 if a certain obstacle is hit.
-        lower: Clopper-Pearson bound of the worlds that occupy a voxel's centre inside a
-            sphere, less what skipping certain voxels may add.
-        upper: Clopper-Pearson bound of the worlds with a voxel whose corners a sphere reaches,
-            and what skipping certain voxels may hide; above 0 even if no world collides.
-            Verdicts with `max_risk` go by it.
-        confidence: of the interval (lower, upper), two-sided; it holds the size of voxels.
-        n_worlds: worlds drawn.
-        seed: of the draws.
-        per_waypoint: (T,) the same probability at each waypoint alone.
-        certain: whether the path hits what is an obstacle in every world: support surface,
-            background, unseen space by policy, known geometry.
-        spacing: no sphere centre moves more than this between two samples, metres; what
-            lies between samples is covered by growing the spheres.
-        configurations: samples taken.
-        trace, volume: find `first_contact` and `shares`, which cost more than the rest and
-            are often not asked for.
+        allowed: how many worlds may collide with what is valid, under `config.max_risk`.
     """
 
-    probability: float
-    lower: float
-    upper: float
-    confidence: float
-    n_worlds: int
-    seed: int
-    per_waypoint: Float[np.ndarray, " t"]
-    certain: bool
-    spacing: float
-    configurations: int
-    trace: Callable[[], tuple[FirstContact, ...]] = field(repr=False)
-    volume: Callable[[], dict[str, float]] = field(repr=False)
+    def __init__(
+        self,
+        world: Any,
+        robot: Any,
+        config: CheckerConfig,
+        rules: Sequence[Collection[int]],
+        link_rules: Int[np.ndarray, " l"],
+    ) -> None:
+        # Probabilities are of touching; verdicts keep the margin as well, and touch a voxel
+        # at its corners.
+        self.setting = draws.make_setting(world, robot, config, rules, link_rules)
+        self._corners = draws.grown(self.setting, draws.CORNER)
+        self._kept = draws.grown(draws.with_margin(self.setting, config.margin), draws.CORNER)
+        worlds = self.setting.worlds
+        lower, upper = clopper_pearson(config.n_worlds, config.confidence)
+        self._lower = np.maximum(lower - worlds.error_occupied, 0.0)
+        # Where something may be touched, a voxel said to be its own may hide another object.
+        hidden = worlds.error_free + (worlds.error_occupied if any(rules) else 0.0)
+        self._upper = np.minimum(upper + hidden, 1.0)
+        self._codes: SpaceCodes | None = None
+        self._held_out: PathRisk | None = None
+        self.allowed = 0
+        if config.max_risk is not None:
+            self.allowed = tolerated_hits(config.max_risk, self._upper, config.n_worlds)
+            for ids in rules:
+                worlds.bake(without=ids)
 
-    @cached_property
-    def first_contact(self) -> tuple[FirstContact, ...]:
-        """What the worlds collide with first: causes, the most frequent first; empty if no
-        world collides."""
-        return self.trace()
+    def tightened(self, level: int) -> "PathRisk | None":
+        """Return the same with a stricter bound on verdicts, None if there is none left.
 
-    @cached_property
-    def shares(self) -> dict[str, float]:
-        """Share of the swept volume that the map cannot judge, by kind: "occluded" (hidden,
-        without support), "unobserved", "outside" (the grid)."""
-        return self.volume()
+        Halves the worlds that may collide, down to none, then grows the spheres by half, one
+        and two voxels. What the stricter one accepts, this one accepts.
+        """
+        stricter = copy.copy(self)
+        halvings = self.allowed.bit_length()  # after so many, none is left
+        stricter.allowed = self.allowed >> min(level, halvings)
+        if level > halvings:
+            if level - halvings > len(draws.PADDINGS):
+                return None
+            stricter._kept = draws.grown(self._kept, draws.PADDINGS[level - halvings - 1])
+        return stricter
 
-    @property
-    def unsupported_share(self) -> float:
-        """Share of the swept volume in space that the map cannot judge."""
-        return sum(self.shares.values())
+    def held_out(self) -> "PathRisk":
+        """Return the same with worlds that no verdict has seen."""
+        if self._held_out is None:
+            other = copy.copy(self)
+            worlds = self.setting.worlds
+            other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
+            other._corners = draws.grown(other.setting, draws.CORNER)
+            self._held_out = other
+        return self._held_out
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Find what is left to find before the estimate leaves the process."""
-        found = {"first_contact": self.first_contact, "shares": self.shares}
-        return {**self.__dict__, **found, "trace": tuple, "volume": dict}
+    # --- verdicts ----------------------------------------------------------------------
+    def accepts(self, path: Float[np.ndarray, "t dof"]) -> bool:
+        """Whether few enough worlds come within the margin anywhere on a path, certain
+        obstacles aside."""
+        return bool(draws.count_path(self._kept, path).touched.sum() <= self.allowed)
 
-    def text(self) -> str:
-        """Return the estimate in one line."""
-        line = (
-            f"P(collision) {self.probability:.3f} "
-            f"({100 * self.confidence:.0f}% interval {self.lower:.3f} to {self.upper:.3f}, "
-            f"{self.n_worlds} worlds)"
+    def accepts_one(self, q: Float[np.ndarray, "dof"]) -> bool:
+        """Return `accepts` of one configuration: the quick way."""
+        return draws.count_at(self._kept, q)[1] <= self.allowed
+
+    def accepts_each(self, Q: Float[np.ndarray, "n dof"]) -> Bool[np.ndarray, " n"]:
+        """Return `accepts` of each configuration by itself."""
+        return draws.count_each(self._kept, Q).counts <= self.allowed
+
+    def exceeded_at(self, edge: Float[np.ndarray, "2 dof"]) -> float:
+        """Return where along an edge, 0 to 1, more worlds have collided than are allowed."""
+        sweep = draws.count_path(self._kept, edge)
+        first = np.sort(sweep.first[sweep.first >= 0])
+        return float(first[self.allowed]) / max(1, len(sweep.counts) - 1)
+
+    def contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
+        """Return which links touch which objects in how many worlds, the most frequent first."""
+        sweep = draws.count_path(self._kept, q[None])
+        return draws.risky_contacts(self._kept, sweep, float(self._upper[int(sweep.touched.sum())]))
+
+    # --- estimates ---------------------------------------------------------------------
+    def estimate(self, path: Float[np.ndarray, "t dof"], with_margin: bool = False) -> RiskEstimate:
+        """Return the joint probability of collision along a path, or of coming within the
+        margin; of a configuration, where the path has one row."""
+        at = draws.grown(self._kept, -draws.CORNER) if with_margin else self.setting
+        path = path.copy()
+        n, inside = at.worlds.n_worlds, 0
+        around = sweep = draws.count_path(self._kept if with_margin else self._corners, path)
+        if around.touched.any():
+            sweep = draws.recount(at, around)
+            # A draw that occupies the centre of a voxel occupies that point, whatever voxels are.
+            inside = int(draws.recount(draws.grown(at, -0.5), around, within=True).touched.sum())
+        clear = np.empty(len(path), np.bool_)
+        checking.is_valid_batch(path, at.floats, at.ints, *at.packed, clear)
+        stats = np.zeros(4)
+        edge = -1 if clear.all() else 0
+        if len(path) > 1:
+            edge = checking.check_path(
+                path, at.floats, at.ints, *at.packed, at.config.min_motion, stats
+            )
+        certain = edge >= 0
+        per_waypoint = sweep.counts[sweep.waypoints] / n
+        per_waypoint[~clear] = 1.0
+        return RiskEstimate(
+            probability=1.0 if certain else float(sweep.touched.sum()) / n,
+            lower=1.0 if certain else float(self._lower[inside]),
+            upper=1.0 if certain else float(self._upper[int(around.touched.sum())]),
+            confidence=at.config.confidence,
+            n_worlds=n,
+            seed=at.worlds.seed,
+            per_waypoint=per_waypoint,
+            certain=certain,
+            spacing=at.spacing,
+            configurations=len(sweep.centers),
+            trace=lambda: draws.first_contacts(at, path, sweep, edge, float(stats[0])),
+            volume=lambda: self._shares(at, sweep.centers),
         )
-        if self.first_contact:
-            line += f"; {self.first_contact[0].text()}"
-        if self.unsupported_share > 0.005:
-            line += f"; {100 * self.unsupported_share:.0f}% of the swept volume is not judged"
-        return line
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready keys."""
+    def _shares(self, at: draws.Setting, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:
+        if self._codes is None:
+            self._codes = SpaceCodes(at.world)
+        return self._codes.shares(centers, at.radii, at.sphere_tables)
+
+
+class SpaceCodes:
+    """What is known of the space around each node of a world's grid.
+
+    0: seen, or hidden where the map has support. 1: hidden without support. 2: never
+    observed. 3 (not stored): outside the grid. Baked once, O(nodes), one byte per node.
+
+    Args:
+        world: a `vprism_plan.world.World`.
+    """
+
+    def __init__(self, world: Any) -> None:
+        field = world.field
+        self._origin = np.asarray(field.origin, dtype=np.float64)
+        self._spacing = float(field.spacing)
+        shape = field.distance.shape
+        self._codes = np.empty(shape, np.uint8)
+        for start in range(0, shape[0], _SLAB):
+            stop = min(start + _SLAB, shape[0])
+            index = np.moveaxis(np.indices((stop - start, *shape[1:])), 0, -1).reshape(-1, 3)
+            corner = self._origin + self._spacing * np.array([start, 0, 0])
+            points = corner + self._spacing * index
+            codes = np.asarray(world.status(points)).astype(np.uint8)
+            codes[codes == 3] = 0  # rounding at the faces
+            hidden = np.flatnonzero(codes == 1)
+            judged = np.asarray(world.map.support(points[hidden])) >= world.config.min_support
+            codes[hidden[judged]] = 0
+            self._codes[start:stop] = codes.reshape(stop - start, *shape[1:])
+
+    def shares(
+        self,
+        centers: Float[np.ndarray, "n 3 s"],
+        radii: Float[np.ndarray, " s"],
+        rules: Int[np.ndarray, " s"],
+    ) -> dict[str, float]:
+        """Return the share of the swept volume that lies in each kind of space not judged.
+
+        Seven points per ball (its centre and six at three fifths of the radius), balls
+        weighted by volume, averaged over at most 64 samples spread along the path.
+        Balls with rule -1 (not checked) do not count.
+        """
+        n = len(centers)
+        chosen = _ONE if n == 1 else np.arange(m := min(n, _MAX_SAMPLES)) * (n - 1) // (m - 1)
+        totals = np.zeros(4)
+        kernels.volume_codes(
+            centers, chosen, radii, rules, self._codes, self._origin, self._spacing, totals
+        )
+        seen, occluded, unobserved, outside = totals.tolist()
+        whole = max(seen + occluded + unobserved + outside, 1e-300)
         return {
-            "probability": self.probability,
-            "lower": self.lower,
-            "upper": self.upper,
-            "confidence": self.confidence,
-            "n_worlds": self.n_worlds,
-            "seed": self.seed,
-            "per_waypoint": [float(p) for p in self.per_waypoint],
-            "first_contact": [vars(cause) for cause in self.first_contact],
-            "certain": self.certain,
-            "unsupported_share": self.unsupported_share,
-            "shares": dict(self.shares),
-            "spacing": self.spacing,
-            "configurations": self.configurations,
+            "occluded": occluded / whole,
+            "unobserved": unobserved / whole,
+            "outside": outside / whole,
         }
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vprism_plan._kernels import trajopt as kernels
 from vprism_plan._threads import run_chunked
-from vprism_plan.collision._packing import pack_robot
+from vprism_plan.collision.packing import pack_robot
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.trajopt.cost import MAX_PARTS, MAX_TURN, Subdivision
 

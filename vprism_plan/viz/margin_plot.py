@@ -12,7 +12,7 @@ from vprism_plan.viz._figures import new_figure, object_color
 
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
-    from vprism_plan.collision.margin_reports import SafetyMargins
+    from vprism_plan.collision.margins import SafetyMargins
 
 # Obstacles that are no object: greys and blues that no object has, told apart by the line.
 _OTHERS: dict[str, tuple[Any, str]] = {

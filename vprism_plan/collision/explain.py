@@ -8,15 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._kernels.checking import FARTHEST
-from vprism_plan.collision._bodies import kind_of
-from vprism_plan.collision.protocols import Answers, BakedWorld, NodeField, RuledWorld
-from vprism_plan.collision.reports import Contact, Kind, StateReport
+from vprism_plan.collision.reports import Contact, Kind, StateReport, as_point, kind_of
 from vprism_plan.world.visibility import free_balls
 
 # Signed distance, metres; where, world; unit direction that leads out.
 Touch = tuple[Any, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 _STATUS_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
+_UP = np.array([0.0, 0.0, 1.0])  # out of what says nothing of the way out
 _SAMPLES = 96
 _AROUND = 2  # nodes beyond a point's cell that are asked for the nearest obstacle's name
 
@@ -35,65 +34,67 @@ def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
     return directions * radius[:, None]
 
 
-def explain(checker: Answers, q: Float[np.ndarray, "dof"]) -> StateReport:
+def explain(checker: Any, q: Float[np.ndarray, "dof"]) -> StateReport:
     """Return the report of `CollisionChecker.explain`."""
 
-    def reasons() -> list[Contact]:
-        near = [*_world_contacts(checker, q), *_self_contacts(checker, q)]
-        return [*near, *limit_contacts(checker.robot, q)]
+    def contacts(q: np.ndarray) -> list[Contact]:
+        found = [*_world_contacts(checker, q), *_self_contacts(checker, q)]
+        found += limit_contacts(checker.robot, q)
+        return [*by_depth(found), *checker.risk_contacts(q)]
 
     return report(
         checker,
         q,
-        reasons,
-        lambda: checker.risk_contacts(q),
-        lambda: _allowed_contacts(checker, q),
-        lambda: checker.sphere_clearances(q)[0],
+        contacts,
+        lambda q: _allowed_contacts(checker, q),
+        lambda q: checker.sphere_clearances(q)[0],
     )
 
 
 def report(
     checker: Any,
     q: Float[np.ndarray, "dof"],
-    reasons: Callable[[], list[Contact]],
-    risks: Callable[[], Iterable[Contact]],
-    permitted: Callable[[], Iterable[Contact]],
-    centers: Callable[[], Float[np.ndarray, "s 3"]],
+    contacts: Callable[[np.ndarray], Iterable[Contact]],
+    permitted: Callable[[np.ndarray], Iterable[Contact]],
+    centers: Callable[[np.ndarray], Float[np.ndarray, "s 3"]],
 ) -> StateReport:
     """Put the report of a checker together.
 
     Args:
         checker: whose verdict it is.
         q: configuration.
-        reasons: what refuses it, asked if it is refused.
-        risks: what `max_risk` refuses, likewise; named last.
+        contacts: what refuses it, in the order of the report; asked only if it is refused.
         permitted: contacts that the rules permit.
         centers: of the robot's spheres, world, metres.
     """
-    world = checker.world
+    world, margin = checker.world, checker.config.margin
     policies = {"occluded": world.config.occluded, "unobserved": world.config.unobserved}
-    margin = checker.config.margin
+    told: dict[str, Any] = {"policies": policies, "warnings": checker.warnings}
     if not np.isfinite(q).all():
         limits = tuple(limit_contacts(checker.robot, q))
-        return StateReport(
-            False, limits, np.nan, np.nan, margin, policies=policies, warnings=checker.warnings
-        )
+        return StateReport(False, limits, np.nan, np.nan, margin, **told)
     valid = checker.is_valid(q)
-    contacts: list[Contact] = []
-    if not valid:
-        contacts = sorted(reasons(), key=lambda contact: -contact.depth)
-        contacts += risks()
     return StateReport(
         valid=valid,
-        contacts=tuple(contacts),
+        contacts=() if valid else tuple(contacts(q)),
         clearance=checker.clearance(q),
         self_clearance=float(checker.self_clearance_batch(q[None])[0]),
         margin=margin,
-        shares=volume_shares(world, checker.robot, centers()),
-        policies=policies,
-        allowed=tuple(permitted()),
-        warnings=checker.warnings,
+        shares=volume_shares(world, checker.robot, centers(q)),
+        allowed=tuple(permitted(q)),
+        **told,
     )
+
+
+def warnings_of(world: Any, robot: Any) -> tuple[str, ...]:
+    """What is usable but odd about a world and a robot."""
+    found = (*getattr(world, "warnings", ()), *getattr(robot, "warnings", ()))
+    return tuple(dict.fromkeys(found))
+
+
+def by_depth(contacts: Iterable[Contact]) -> list[Contact]:
+    """Return contacts, the deepest first."""
+    return sorted(contacts, key=lambda contact: -contact.depth)
 
 
 def volume_shares(world: Any, robot: Any, centers: Float[np.ndarray, "s 3"]) -> dict[str, float]:
@@ -138,7 +139,7 @@ def limit_contacts(robot: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
     return found
 
 
-def _world_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def _world_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
     """Return the deepest contact of each (link, body), from every sphere's own distances."""
     robot, world, margin = checker.robot, checker.world, checker.config.margin
     centers, plane, which, field = checker.sphere_clearances(q)
@@ -184,41 +185,35 @@ def contact(
 ) -> Contact:
     """Return a contact from how near, where and which way out, and the distance asked for."""
     gap, position, normal = touch
-    x, y, z = (float(v) for v in position)
-    nx, ny, nz = (float(v) for v in normal)
-    place, out = (x, y, z), (nx, ny, nz)
-    depth, required = float(required - gap), float(required)
-    return Contact(kind, link, body, depth, sphere, place, out, probability, detail, required)
+    return Contact(
+        kind, link, body, float(required - gap), sphere, as_point(position), as_point(normal),
+        probability, detail, float(required),
+    )  # fmt: skip
 
 
 def deepest(contacts: Iterable[Contact]) -> list[Contact]:
     """Return the deepest contact of each link and body."""
     found: dict[tuple[str, str], Contact] = {}
     for item in contacts:
-        key = (item.link, item.body)
-        if key not in found or found[key].depth < item.depth:
-            found[key] = item
+        kept = found.setdefault((item.link, item.body), item)
+        if kept.depth < item.depth:
+            found[item.link, item.body] = item
     return list(found.values())
 
 
 def policy_detail(config: Any, kind: Kind) -> str:
     """Return why what no object of the map accounts for is an obstacle."""
-    if kind == "occluded":
-        return f"no camera saw this space; policy occluded={config.occluded!r}"
     if kind == "unobserved" and config.unobserved == "free":
         return "farther away than was judged; WorldConfig(bounds=...) can take it in"
-    if kind == "unobserved":
-        return f"no camera looked here; policy unobserved={config.unobserved!r}"
-    if kind == "background":
-        return "observed points without an object label"
-    return ""
+    return {
+        "occluded": f"no camera saw this space; policy occluded={config.occluded!r}",
+        "unobserved": f"no camera looked here; policy unobserved={config.unobserved!r}",
+        "background": "observed points without an object label",
+    }.get(kind, "")
 
 
 def _beside_pictured_robot(
-    sphere: Float[np.ndarray, "4"],
-    robots: Float[np.ndarray, "s 4"],
-    margin: float,
-    world: BakedWorld,
+    sphere: Float[np.ndarray, "4"], robots: Float[np.ndarray, "s 4"], margin: float, world: Any
 ) -> str:
     """The remedy for a sphere in the shadow of the robot as it was in a picture, or nothing."""
     away = np.linalg.norm(robots[:, :3] - sphere[:3], axis=1)
@@ -228,12 +223,10 @@ def _beside_pictured_robot(
     return f"; beside the pictured robot: ignore_self(..., room={room:g}) is your word for it"
 
 
-def _allowed_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def _allowed_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
     """Return the deepest contact of each link with each object that it may touch."""
     robot, world = checker.robot, checker.world
-    if not isinstance(world, RuledWorld) or not any(
-        checker.allowed_objects(link) for link in range(len(robot.link_names))
-    ):
+    if not any(checker.allowed_objects(link) for link in range(len(robot.link_names))):
         return []
     centers = checker.sphere_clearances(q)[0]
     found = []
@@ -254,7 +247,7 @@ def _allowed_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Con
 
 
 def nearest_source(
-    world: BakedWorld, field: NodeField, point: Float[np.ndarray, "3"]
+    world: Any, field: Any, point: Float[np.ndarray, "3"]
 ) -> tuple[str, Float[np.ndarray, "3"]]:
     """Return the name of the obstacle nearest to a point and the direction away from it.
 
@@ -265,11 +258,10 @@ def nearest_source(
     shape = np.array(field.distance.shape)
     g = (point - field.origin) / field.spacing
     past = bool(np.any(g < 0) or np.any(g > shape - 1))
-    grid: Any = field
-    beyond: Any = getattr(field, "beyond", None)
+    beyond = getattr(field, "beyond", None)
     if past and beyond is not None:
-        at = point[None]
-        if float(beyond.lower_bound(at)[0]) <= float(grid.lower_bound(at)[0]):
+        bounds = [float(grid.lower_bound(point[None])[0]) for grid in (beyond, field)]
+        if bounds[0] <= bounds[1]:
             return nearest_source(world, beyond, point)
     solid = world.config.unobserved == "occupied" or getattr(field, "solid_outside", False)
     outside = past and solid
@@ -288,12 +280,12 @@ def nearest_source(
     if outside:
         gradient = inside - g
     length = float(np.linalg.norm(gradient))
-    normal = gradient / length if np.isfinite(length) and length > 0 else np.array([0.0, 0.0, 1.0])
+    normal = gradient / length if np.isfinite(length) and length > 0 else _UP
     name = "unobserved" if outside else world.sources[int(field.source[tuple(nearest)])]
     return name, normal
 
 
-def _self_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def _self_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
     robot, margin = checker.robot, checker.config.self_margin
     gaps, spheres = checker.pair_gaps(q)
     centers = checker.sphere_clearances(q)[0]
@@ -303,7 +295,7 @@ def _self_contacts(checker: Answers, q: Float[np.ndarray, "dof"]) -> list[Contac
         s, t = (int(sphere) for sphere in spheres[p])
         apart = centers[s] - centers[t]
         length = float(np.linalg.norm(apart))
-        normal = apart / length if length > 0 else np.array([0.0, 0.0, 1.0])
+        normal = apart / length if length > 0 else _UP
         point = centers[s] - robot.sphere_radii[s] * normal
         names, touch = robot.link_names, (float(gaps[p]), point, normal)
         found.append(contact("self", names[a], names[b], touch, margin, s))

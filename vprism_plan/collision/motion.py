@@ -1,21 +1,164 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Clearance over whole edges, and how far a motion stays safe: bounds, not samples."""
+"""How far joints carry spheres along edges, and what that says of all that lies between.
+
+Bounds, not samples: the clearance over whole paths, and how far a motion stays safe.
+"""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
-from vprism_plan.collision._travel import checked_tolerance, edges_of, motion_bounds
-from vprism_plan.collision.protocols import Numbers
+from vprism_plan.collision.inputs import (
+    AT_MOST,
+    Numbers,
+    checked_tolerance,
+    configuration,
+    configurations,
+    waypoints,
+)
+from vprism_plan.collision.packing import reach_table
 from vprism_plan.collision.reports import StateReport
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.kinematics import joint_values
+from vprism_plan.robots import KinematicArrays
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses
 
 _BATCH = 64  # configurations asked at once where clearance is too small to step by
 _HALVINGS = 60
 _MOST_INTERVALS = 1_000_000  # of a path at once: what is kept of them fits in memory
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The straight edges of a path, and how far they can move anything.
+
+    Attributes:
+        path: (T, dof) waypoints.
+        delta: (T - 1, dof) change of the joints along each edge, as the rows say.
+        motion: (T - 1,) upper bound of any sphere's way along each edge, metres.
+        pair_motion: the same for the change of any gap between two links.
+    """
+
+    path: Float[np.ndarray, "t dof"]
+    delta: Float[np.ndarray, "e dof"]
+    motion: Float[np.ndarray, " e"]
+    pair_motion: Float[np.ndarray, " e"]
+
+    def at(
+        self, edge: Int[np.ndarray, " n"], fraction: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, "n dof"]:
+        """Configurations at fractions of edges."""
+        return self.path[edge] + fraction[:, None] * self.delta[edge]
+
+    def samples(
+        self, tolerance: float
+    ) -> tuple[Float[np.ndarray, "n dof"], Float[np.ndarray, " n"]]:
+        """Configurations with at most `tolerance` metres of motion to the nearest of them.
+
+        Returns:
+            The configurations, every waypoint among them, and their place on the path:
+            the edge's number plus the fraction of it.
+
+        Raises:
+            RobotError: that would be more than two hundred thousand.
+        """
+        reach = np.maximum(self.motion, self.pair_motion)
+        steps = np.maximum(1, np.ceil(reach / (2.0 * tolerance) - 1e-9)).astype(np.int64)
+        if steps.sum() > AT_MOST:
+            raise RobotError(
+                f"a path of up to {reach.sum():.3g} m of motion needs {int(steps.sum()):,} "
+                f"configurations at a tolerance of {tolerance:g} m; at most {AT_MOST:,}: "
+                "give a coarser tolerance or a shorter path"
+            )
+        edge = np.repeat(np.arange(len(steps)), steps)
+        first = np.repeat(np.cumsum(steps) - steps, steps)
+        fraction = (np.arange(len(edge)) - first) / np.repeat(steps, steps)
+        last = len(self.path) - 1
+        Q = np.concatenate([self.at(edge, fraction), self.path[last:]])
+        return Q, np.append(edge + fraction, float(last))
+
+
+def edges_of(checker: Any, path: Numbers, single: bool = False) -> Edges:
+    """Check a path (T, dof) and bound its motion.
+
+    Raises:
+        RobotError: the shape is wrong, a value is not finite, or a sliding joint leaves
+            its limits, beyond which its motion has no bound.
+    """
+    array = waypoints(checker.robot, path, single)
+    delta = np.diff(array, axis=0)
+    return Edges(array, delta, *motion_bounds(checker.robot.arrays, delta))
+
+
+def motion_bounds(
+    arrays: KinematicArrays, delta: Float[np.ndarray, "e dof"]
+) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
+    """Bound how far any sphere moves, and how much any link pair's gap changes, metres.
+
+    Args:
+        arrays: the robot.
+        delta: (E, dof) changes of the joints along straight edges.
+    """
+    table = reach_table(arrays)  # (frames, links): metres per unit, -1 where it moves nothing
+    speed = np.abs(delta[:, np.maximum(arrays.q_index, 0)] * arrays.q_mult)
+    speed[:, 0] = 0.0
+    links = speed @ np.maximum(table, 0.0)
+    a, b = table[:, arrays.pairs[:, 0]], table[:, arrays.pairs[:, 1]]
+    between = np.where((a >= 0.0) != (b >= 0.0), np.maximum(a, b), 0.0)
+    return links.max(axis=1, initial=0.0), (speed @ between).max(axis=1, initial=0.0)
+
+
+def joint_units(arrays: KinematicArrays) -> tuple[str, ...]:
+    """Unit of every joint of a configuration: "rad", or "m" for sliding joints."""
+    slides = set(arrays.q_index[arrays.kind == KIND_PRISMATIC].tolist())
+    return tuple("m" if j in slides else "rad" for j in range(len(arrays.lower)))
+
+
+def place_points(
+    R: Float[np.ndarray, "n f 3 3"],
+    t: Float[np.ndarray, "n f 3"],
+    frames: Int[np.ndarray, " s"],
+    local: Float[np.ndarray, "s 3"],
+) -> Float[np.ndarray, "n s 3"]:
+    """World positions of points that move with frames, from `robots.kinematics.frame_poses`."""
+    return np.ascontiguousarray(np.einsum("nsij,sj->nsi", R[:, frames], local) + t[:, frames])
+
+
+def sphere_jacobians(
+    arrays: KinematicArrays, Q: Float[np.ndarray, "n dof"], spheres: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 dof"]]:
+    """Centres, metres, of one sphere at each configuration, and their derivatives.
+
+    The geometric Jacobian, metres per radian or metre: axis x (centre - joint) for a
+    revolute joint, the axis for a prismatic one, times the factor of joints that mimic.
+    """
+    R, t = frame_poses(arrays, Q)
+    rows = np.arange(len(Q))
+    frames = arrays.sphere_frame[spheres]
+    local = arrays.sphere_center[spheres]
+    centers = np.einsum("nij,nj->ni", R[rows, frames], local) + t[rows, frames]
+    jacobian = np.zeros((len(Q), 3, Q.shape[1]))
+    for f, carried in enumerate(_carried(arrays.parent)):
+        moved = np.flatnonzero(carried[frames])
+        if f == 0 or len(moved) == 0:
+            continue
+        axis = R[moved, f] @ arrays.axis[f]
+        if arrays.kind[f] != KIND_PRISMATIC:
+            axis = np.cross(axis, centers[moved] - t[moved, f])
+        jacobian[moved, :, arrays.q_index[f]] += arrays.q_mult[f] * axis
+    return centers, jacobian
+
+
+def _carried(parent: Int[np.ndarray, " f"]) -> Bool[np.ndarray, "f f"]:
+    """Entry (f, g): whether frame g moves with frame f."""
+    table = np.eye(len(parent), dtype=bool)
+    for g in range(1, len(parent)):
+        table[:, g] |= table[:, parent[g]]
+    return table
+
+
+# --- bounds over whole motions --------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -51,7 +194,7 @@ class PathClearance:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
-        return dict(self.__dict__)
+        return dict(vars(self))
 
 
 @dataclass(frozen=True)
@@ -150,14 +293,8 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
         half *= 0.5
         edge = np.repeat(edge[still], 2)
         middle = (middle[still][:, None] + half * np.array([-1.0, 1.0])).reshape(-1)
-    return PathClearance(
-        clearance=best - tolerance,
-        tolerance=tolerance,
-        place=place,
-        q=tuple(float(v) for v in q),
-        configurations=count,
-        motion=float(edges.motion.sum()),
-    )
+    motion, where = float(edges.motion.sum()), tuple(q.tolist())
+    return PathClearance(best - tolerance, tolerance, place, where, count, motion)
 
 
 def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.0005) -> SafeMotion:
@@ -183,14 +320,8 @@ def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.
     safe, refused = march.run()
     reason = None if refused is None else checker.explain(march.at(refused))
     gap = 0.0 if refused is None else (refused - safe) * march.motion
-    return SafeMotion(
-        fraction=safe,
-        refused_at=refused,
-        tolerance=max(gap, 0.5 * march.step * march.motion if march.stepped else 0.0),
-        distance=safe * march.motion,
-        reason=reason,
-        configurations=march.count,
-    )
+    gap = max(gap, 0.5 * march.step * march.motion if march.stepped else 0.0)
+    return SafeMotion(safe, refused, gap, safe * march.motion, reason, march.count)
 
 
 class _March:
@@ -198,10 +329,8 @@ class _March:
 
     def __init__(self, checker: Any, q: Numbers, dq: Numbers, tolerance: float) -> None:
         self.checker = checker
-        self.q = joint_values(q, checker.robot, "a configuration")
-        self.dq = joint_values(dq, checker.robot, "a motion")
-        for array in (self.q, self.dq):  # the checker refuses what has another shape
-            checker.clearance(array)
+        ends = (configuration(checker.robot, values) for values in (q, dq))
+        self.q, self.dq = configurations(checker.robot, np.stack([*ends]), finite=True)
         own, gap = motion_bounds(checker.robot.arrays, self.dq[None])
         self.world_rate, self.pair_rate = float(own[0]), float(gap[0])
         self.motion = max(self.world_rate, self.pair_rate)
@@ -254,11 +383,8 @@ class _March:
         self.count += 1
         room = float(self.checker.clearance_batch(Q)[0]) - config.margin - spacing
         gap = float(self.checker.self_clearance_batch(Q)[0]) - config.self_margin
-        spans = [
-            free / rate if rate > 0.0 else np.inf
-            for free, rate in ((room, self.world_rate), (gap, self.pair_rate))
-        ]
-        return min(1.0, *spans)
+        rates = (room, self.world_rate), (gap, self.pair_rate)
+        return min([1.0, *(free / rate for free, rate in rates if rate > 0.0)])
 
     def _bracket(self, safe: float, refused: float) -> tuple[float, float]:
         """Halve the step between a valid and a refused fraction to a millionth of it."""

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision._fcl import Shape
-from vprism_plan.collision.protocols import BakedWorld
+from vprism_plan.collision.mesh.fcl import Shape
 from vprism_plan.world.known import Box, Cylinder, KnownMesh, Sphere
 from vprism_plan.world.levelset import lattice_refinement
 from vprism_plan.world.meshes import extract_refined_meshes
@@ -52,11 +51,6 @@ class Body:
 class MeshWorld:
     """Bodies of a world, and where its objects are.
 
-    Args:
-        world: a `World`.
-        resolution: edge of the objects' marching cubes, metres; None takes the lattice of
-            the world's own field.
-
     Attributes:
         bodies: objects in the map's order, then known geometry, then a support surface that
             ends somewhere.
@@ -64,7 +58,7 @@ class MeshWorld:
         meshes: object id -> `trimesh.Trimesh`, world frame.
     """
 
-    def __init__(self, world: BakedWorld, resolution: float | None = None) -> None:
+    def __init__(self, world: Any, resolution: float | None = None) -> None:
         config = world.config
         if resolution is None:
             refinement = lattice_refinement(config.resolution, world.map.kernel_length)
@@ -121,16 +115,9 @@ def mesh_body(name: str, mesh: Any, class_index: int = 0) -> Body:
     joined = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(len(vertices),) * 2)
     _, piece = connected_components(joined, directed=False)
     _, first = np.unique(piece[faces[:, 0]], return_index=True)
+    shape, box = Shape("mesh", mesh=mesh), (used.min(axis=0), used.max(axis=0))
     closed = vertices[faces] if class_index == 0 and mesh.is_watertight else None
-    return Body(
-        name,
-        class_index,
-        Shape("mesh", mesh=mesh),
-        used.min(axis=0),
-        used.max(axis=0),
-        vertices[faces[first, 0]],
-        closed,
-    )
+    return Body(name, class_index, shape, *box, vertices[faces[first, 0]], closed)
 
 
 def _prism(support: SeenSupport) -> Any:

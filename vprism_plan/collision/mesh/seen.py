@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from vprism_plan.collision._solids import PlacedSolids
-from vprism_plan.collision.mesh_reports import SEEN
+from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
 from vprism_plan.world.seen import lost_cones, lost_points, surface_points
 
+SEEN = "a camera saw it there"  # the detail of contacts with observed points
 _CELL = 0.03  # metres: one sample of a solid's surface per cube of this edge
 _DRAWN = 4000  # points per solid from which they are taken
 _ENOUGH = 64  # points of one body whose depth in a solid is worked out, those deepest in its hull
@@ -29,15 +29,15 @@ class SeenPoints:
     but all of them, however near they lie to the map's surfaces. Where a labelled pixel has no
     depth, the points where its object may be, a grid step apart.
 
-    Args:
-        world: a `World`.
-
     Attributes:
         bodies: what the points show, and how that is known: ("object:3", SEEN), ...
         classes: (bodies,) class of the map, 0 for what no rule lets a link touch.
     """
 
-    def __init__(self, world: Any) -> None:
+    def __init__(
+        self, world: Any, placed: PlacedSolids, allowed: Bool[np.ndarray, "links classes"]
+    ) -> None:
+        self._placed, self._allowed = placed, allowed[placed.links]
         map_, config = world.map, world.config
         bounded = config.support == "seen"
         points, half = visibility.background_points(
@@ -61,75 +61,57 @@ class SeenPoints:
         self.points = np.concatenate([points for _, points, _ in parts])
         self.half = np.concatenate([half for _, _, half in parts])
         self.body = np.repeat([k for k, _, _ in parts], [len(points) for _, points, _ in parts])
-        self._tree = cKDTree(self.points) if len(self.points) else None
+        self._tree = cKDTree(self.points)
         self._widest = float(np.max(self.half, initial=0.0))
 
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def near(self, placed: PlacedSolids, need: Float[np.ndarray, "n"]) -> list[int]:
+    def near(self, need: Float[np.ndarray, "n"]) -> list[int]:
         """Moving solids whose balls come within `need` (metres) of any point."""
-        if self._tree is None:
-            return []
-        reach = placed.radii + need + self._widest
+        placed, reach = self._placed, self._placed.radii + need + self._widest
         most = float(np.max(reach[placed.moving], initial=0.0))
         away, _ = self._tree.query(placed.centers, distance_upper_bound=most + 1e-9)
         return np.flatnonzero(placed.moving & (away <= reach)).tolist()
 
-    def inside(
-        self, placed: PlacedSolids, i: int, need: float, allowed: Bool[np.ndarray, "classes"]
-    ) -> Iterator[int]:
-        """Points within `need` (metres) of a solid, those that seem deepest first.
-
-        Args:
-            placed: the robot's solids.
-            i: which.
-            need: distance to keep.
-            allowed: classes that it may touch.
-        """
-        rows = self._around(placed, i, need)
-        rows = rows[~allowed[self.classes[self.body[rows]]]]
+    def inside(self, i: int, need: float) -> Iterator[int]:
+        """Points within `need` (metres) of solid i that it may not touch, those that seem
+        deepest first."""
+        rows = self._around(i, need)
         if len(rows):
             reach = self.half[rows] + need
-            for row in placed.points_within(i, self.points[rows], reach):
+            for row in self._placed.points_within(i, self.points[rows], reach):
                 yield int(rows[row])
 
-    def distance(
-        self, placed: PlacedSolids, i: int, best: float, allowed: Bool[np.ndarray, "classes"]
-    ) -> float:
+    def distance(self, i: int, best: float) -> float:
         """Signed distance from a solid to the nearest point, metres; `best` if none is nearer."""
-        rows = np.arange(len(self.points))
-        if np.isfinite(best):
-            rows = self._around(placed, i, max(best, 0.0))
-        rows = rows[~allowed[self.classes[self.body[rows]]]]
+        placed, rows = self._placed, self._around(i, max(best, 0.0))
         bound = placed.solids[i].bound(placed.to_link(i, self.points[rows])) - self.half[rows]
-        for row, least in sorted(zip(rows.tolist(), bound.tolist(), strict=True), key=_second):
+        order = np.argsort(bound, kind="stable")
+        for row, least in zip(rows[order].tolist(), bound[order].tolist(), strict=True):
             if least >= best:
                 break
             best = min(best, placed.point_gap(i, self.points[row]) - float(self.half[row]))
         return best
 
-    def deepest(
-        self, placed: PlacedSolids, i: int, need: float, allowed: Bool[np.ndarray, "classes"]
-    ) -> dict[int, tuple[float, int]]:
+    def deepest(self, i: int, need: float) -> dict[int, tuple[float, int]]:
         """Body -> how far its deepest point is from a solid (signed, metres), and which it is."""
         found: dict[int, tuple[float, int]] = {}
         looked = np.zeros(len(self.bodies), dtype=np.int64)
-        for row in self.inside(placed, i, need, allowed):
+        for row in self.inside(i, need):
             body = int(self.body[row])
             looked[body] += 1
             if looked[body] <= _ENOUGH:
-                gap = placed.point_gap(i, self.points[row]) - float(self.half[row])
+                gap = self._placed.point_gap(i, self.points[row]) - float(self.half[row])
                 if body not in found or gap < found[body][0]:
                     found[body] = gap, row
         return found
 
-    def _around(self, placed: PlacedSolids, i: int, reach: float) -> Int[np.ndarray, "n"]:
-        """Points near a solid's ball."""
-        if self._tree is None:
-            return np.empty(0, dtype=np.int64)
-        ball = float(placed.radii[i]) + reach + self._widest
-        return np.array(self._tree.query_ball_point(placed.centers[i], ball), dtype=np.int64)
+    def _around(self, i: int, reach: float) -> Int[np.ndarray, "n"]:
+        """Points near a solid's ball, but for what it may touch; all, if the reach is infinite."""
+        rows = np.arange(len(self.points))
+        if np.isfinite(reach):
+            ball = float(self._placed.radii[i]) + reach + self._widest
+            found = self._tree.query_ball_point(self._placed.centers[i], ball)
+            rows = np.array(found, dtype=np.int64)
+        return rows[~self._allowed[i, self.classes[self.body[rows]]]]
 
 
 def judged_field(world: Any) -> Any:
@@ -138,20 +120,11 @@ def judged_field(world: Any) -> Any:
     return world.field if beyond is None else beyond
 
 
-def _second(pair: tuple[int, float]) -> float:
-    return pair[1]
-
-
 class HiddenSpace:
     """What no camera saw, by the world's policies, asked at points of the robot's surface.
 
     One point per cube of 3 cm of each moving solid's surface, moved outward by its padding.
     What lies between the points is not noticed.
-
-    Args:
-        world: a `World`.
-        placed: the robot's solids.
-        padding: (n,) metres of each.
     """
 
     def __init__(self, world: Any, placed: PlacedSolids, padding: Float[np.ndarray, "n"]) -> None:

@@ -8,15 +8,19 @@ each link, which is what the continuous edge check advances by.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision.protocols import BakedWorld, NodeField, SphereRobot
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
 
 _HEADER = 24
+
+# Kernel view of a world: distances at nodes and in blocks (metres, float32), (rules, x, y, z)
+# each, and the grid, plane and margin data.
+PackedWorld = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -25,16 +29,6 @@ class PackedRobot:
 
     floats: Float[np.ndarray, "f"]
     ints: Int[np.ndarray, "i"]
-
-
-@dataclass(frozen=True)
-class PackedWorld:
-    """Kernel view of a world: distances at nodes and in blocks (metres, float32) for each
-    contact rule, and the grid, plane and margin data."""
-
-    distance: Float[np.ndarray, "g nx ny nz"]
-    blocks: Float[np.ndarray, "g bx by bz"]
-    floats: Float[np.ndarray, "w"]
 
 
 def _rotation_from_z(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -62,20 +56,6 @@ def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
     return float(np.max(np.abs(ends + arrays.q_offset[frame])))
 
 
-def require_prismatic_limits(robot: SphereRobot, rows: Float[np.ndarray, "n dof"]) -> None:
-    """Raise RobotError if a prismatic joint leaves its limits: its motion has no bound there."""
-    arrays = robot.arrays
-    for joint in np.unique(arrays.q_index[arrays.kind == 2]):
-        values = rows[:, joint]
-        low, high = arrays.lower[joint], arrays.upper[joint]
-        bad = np.flatnonzero((values < low) | (values > high))
-        if len(bad):
-            raise RobotError(
-                f"prismatic joint {robot.joint_names[joint]} is {values[bad[0]]:.4f} m, outside "
-                f"its limits [{low:.4f}, {high:.4f}]; ask inside them"
-            )
-
-
 def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
     """Bound the distance between each joint's axis and each link's sphere centres.
 
@@ -84,11 +64,10 @@ def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
     (metres per radian; 1 for prismatic joints); -1 where f does not move l. Offsets
     along the chain are added up, which is the triangle inequality.
     """
-    n_links = len(arrays.link_frame)
-    table = np.full((len(arrays.parent), n_links), -1.0)
+    table = np.full((len(arrays.parent), len(arrays.link_frame)), -1.0)
     chains = _ancestors(arrays.parent)
-    for link in range(n_links):
-        chain = chains[int(arrays.link_frame[link])]
+    for link, own in enumerate(arrays.link_frame):
+        chain = chains[int(own)]
         rows = slice(int(arrays.link_start[link]), int(arrays.link_start[link + 1]))
         centers = arrays.sphere_center[rows]
         # reach: from the origin of the frame below to the farthest sphere centre
@@ -127,9 +106,7 @@ def _frame_floats(arrays: KinematicArrays) -> tuple[np.ndarray, list[np.ndarray]
 
 
 def pack_robot(
-    arrays: KinematicArrays,
-    self_margin: float = 0.0,
-    rules: Int[np.ndarray, "l"] | None = None,
+    arrays: KinematicArrays, self_margin: float = 0.0, rules: Int[np.ndarray, "l"] | None = None
 ) -> PackedRobot:
     """Pack a robot's kinematics, spheres and pairs for the kernels.
 
@@ -142,8 +119,7 @@ def pack_robot(
     Raises:
         RobotError: A prismatic joint has no finite limits, so its motion has no bound.
     """
-    prismatic = np.flatnonzero(arrays.kind == 2)
-    for frame in prismatic:
+    for frame in np.flatnonzero(arrays.kind == 2):
         if not np.isfinite(_prismatic_travel(arrays, int(frame))):
             raise RobotError(
                 f"prismatic joint number {int(arrays.q_index[frame])} has infinite limits; "
@@ -158,24 +134,12 @@ def pack_robot(
                 "same state; make the followed joint revolute, with limits"
             )
     frames, turned = _frame_floats(arrays)
-    n_frames, n_links = len(arrays.parent), len(arrays.link_frame)
-    spheres = np.empty((len(arrays.sphere_radius), 4))
-    for s, frame in enumerate(arrays.sphere_frame):
-        spheres[s, :3] = turned[int(frame)].T @ arrays.sphere_center[s]
-    spheres[:, 3] = arrays.sphere_radius
-    bounding = np.empty((n_links, 4))
-    for link, frame in enumerate(arrays.link_frame):
-        bounding[link, :3] = turned[int(frame)].T @ arrays.link_center[link]
-    bounding[:, 3] = arrays.link_radius
+    n_links = len(arrays.link_frame)
+    spheres = _turned(turned, arrays.sphere_frame, arrays.sphere_center, arrays.sphere_radius)
+    bounding = _turned(turned, arrays.link_frame, arrays.link_center, arrays.link_radius)
     limits = np.column_stack([arrays.lower, arrays.upper])
-    float_parts = [
-        frames,
-        spheres.T,
-        bounding,
-        limits,
-        reach_table(arrays),
-        np.array([self_margin, *arrays.link_padding[arrays.pairs].sum(axis=1)]),
-    ]
+    gaps = np.array([self_margin, *arrays.link_padding[arrays.pairs].sum(axis=1)])
+    float_parts = [frames, spheres.T, bounding, limits, reach_table(arrays), gaps]
     frame_ints = np.column_stack([arrays.parent, arrays.kind, np.maximum(arrays.q_index, 0)])
     starts, ends = arrays.link_start[:-1], arrays.link_start[1:]
     rules = np.zeros(n_links, dtype=np.int64) if rules is None else rules
@@ -183,14 +147,20 @@ def pack_robot(
     link_ints = np.column_stack([arrays.link_frame, starts, ends, rules])
     int_parts = [frame_ints, link_ints, arrays.pairs, arrays.continuous.astype(np.int64)]
     header = np.zeros(_HEADER, dtype=np.int64)
-    header[:5] = n_frames, len(spheres), n_links, len(arrays.pairs), len(arrays.lower)
+    header[:5] = len(frames), len(spheres), n_links, len(arrays.pairs), len(arrays.lower)
     header[8:12] = _HEADER + np.cumsum([0, *[part.size for part in int_parts[:-1]]])
     header[16:22] = np.cumsum([0, *[part.size for part in float_parts[:-1]]])
-    floats = np.concatenate(
-        [np.asarray(part, dtype=np.float64).reshape(-1) for part in float_parts]
-    )
-    ints = np.concatenate([header, *[np.asarray(p, dtype=np.int64).reshape(-1) for p in int_parts]])
-    return PackedRobot(floats=floats, ints=ints)
+    floats = np.concatenate([part.reshape(-1) for part in float_parts], dtype=np.float64)
+    ints = np.concatenate([header, *[part.reshape(-1) for part in int_parts]], dtype=np.int64)
+    return PackedRobot(floats, ints)
+
+
+def _turned(
+    turned: list[np.ndarray], frames: np.ndarray, centers: np.ndarray, radii: np.ndarray
+) -> Float[np.ndarray, "n 4"]:
+    """Balls (centre, radius) in frames whose axes were turned to z."""
+    moved = [turned[int(f)].T @ center for f, center in zip(frames, centers, strict=True)]
+    return np.column_stack([np.reshape(moved, (-1, 3)), radii])
 
 
 def block_bounds(
@@ -211,14 +181,9 @@ def block_bounds(
     return np.ascontiguousarray(np.nextafter(bounds, np.float32(-np.inf)))
 
 
-def pack_world(world: BakedWorld, fields: Sequence[NodeField], margin: float) -> PackedWorld:
-    """Pack a baked world for the kernels; `margin` (metres) is the clearance to keep.
-
-    Args:
-        world: Whose half-spaces and policies count.
-        fields: One per contact rule, all on the same nodes and with the same field beyond.
-        margin: Metres.
-    """
+def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
+    """Pack a world's half-spaces and policies for the kernels, and fields on the same nodes with
+    the same field beyond, one per contact rule; `margin` (metres) is the clearance to keep."""
     field = fields[0]
     planes = np.asarray(world.planes, dtype=np.float64).reshape(-1, 4)
     outside = 1.0 if world.config.unobserved == "occupied" else 0.0
@@ -232,4 +197,4 @@ def pack_world(world: BakedWorld, fields: Sequence[NodeField], margin: float) ->
     floats = np.concatenate([head, far], dtype=np.float64)
     distance = np.ascontiguousarray([f.distance for f in fields], dtype=np.float32)
     blocks = np.ascontiguousarray([block_bounds(d, float(field.spacing)) for d in distance])
-    return PackedWorld(distance=distance, blocks=blocks, floats=floats)
+    return distance, blocks, floats

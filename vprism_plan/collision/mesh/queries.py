@@ -3,19 +3,19 @@
 
 import math
 from collections.abc import Iterator
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vprism_plan.collision import _fcl
-from vprism_plan.collision._bodies import kind_of
-from vprism_plan.collision._explain import Touch, contact, deepest, policy_detail
-from vprism_plan.collision._mesh_world import MeshWorld
-from vprism_plan.collision._seen_space import HiddenSpace, SeenPoints
-from vprism_plan.collision._solids import PlacedSolids
 from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.protocols import BakedWorld
-from vprism_plan.collision.reports import Contact
+from vprism_plan.collision.explain import Touch, contact, deepest, policy_detail
+from vprism_plan.collision.mesh import fcl
+from vprism_plan.collision.mesh.seen import HiddenSpace, SeenPoints
+from vprism_plan.collision.mesh.solids import PlacedSolids
+from vprism_plan.collision.mesh.world import MeshWorld
+from vprism_plan.collision.reports import Contact, kind_of
 from vprism_plan.world.visibility import OCCLUDED
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -25,20 +25,13 @@ class Queries:
     """Answers about the configuration that was placed last.
 
     Bounds are compared with numpy first, and FCL is asked only about pairs whose bounds
-    meet: no manager has to be told what moved.
-
-    Args:
-        world: what to avoid.
-        placed: the robot's solids.
-        surfaces: the world's bodies.
-        allowed: link -> class -> whether they may touch; class 0 never.
-        config: margins.
-        seen: whether observed points and hidden space count, too.
+    meet: no manager has to be told what moved. `allowed` says of each link and class whether
+    they may touch (class 0 never), `seen` whether observed points and hidden space count, too.
     """
 
     def __init__(
         self,
-        world: BakedWorld,
+        world: Any,
         placed: PlacedSolids,
         surfaces: MeshWorld,
         allowed: Bool[np.ndarray, "links classes"],
@@ -59,7 +52,7 @@ class Queries:
         self._apart = placed.radii[self._pairs].sum(axis=1) + config.self_margin
         # Pairs of solid and body that are never looked at: allowed, or of a fixed link.
         self._ignored = allowed[placed.links][:, surfaces.classes] | ~placed.moving[:, None]
-        self._points = SeenPoints(world) if seen else None
+        self._points = SeenPoints(world, placed, allowed) if seen else None
         self._hidden = HiddenSpace(world, placed, self._padding) if seen else None
 
     def collides(self) -> bool:
@@ -96,9 +89,8 @@ class Queries:
             best = min(best, self._gap(i, b, int(owner[i])) - self._padding[i])
         if self._points is not None:
             for i in np.flatnonzero(placed.moving).tolist():
-                padding, allowed = float(self._padding[i]), self._allowed[placed.links[i]]
-                nearest = self._points.distance(placed, i, best + padding, allowed)
-                best = min(best, nearest - padding)
+                padding = float(self._padding[i])
+                best = min(best, self._points.distance(i, best + padding) - padding)
         return float(best)
 
     def self_clearance(self) -> float:
@@ -108,15 +100,9 @@ class Queries:
     def contacts(self) -> list[Contact]:
         """Return the deepest contact of each link and body."""
         near = self._near()
-        found = (
-            *self._plane_contacts(),
-            *self._body_contacts(near, self._need),
-            *self._swallowed_contacts(near),
-            *self._point_contacts(),
-            *self._hidden_contacts(),
-            *self._self_contacts(),
-        )
-        return deepest(found)
+        world = self._plane_contacts(), self._body_contacts(near, self._need)
+        seen = self._swallowed_contacts(near), self._point_contacts(), self._hidden_contacts()
+        return deepest(chain(*world, *seen, self._self_contacts()))
 
     def permitted(self) -> list[Contact]:
         """Return the deepest contact of each link with each object that it may touch."""
@@ -128,34 +114,24 @@ class Queries:
     def link_distance(self, link: str, body: str) -> float:
         """Return `MeshChecker.link_distance`, metres."""
         placed, names = self.placed, self.placed.robot.link_names
-        rows = np.flatnonzero(placed.links == names.index(link))
+        rows = np.flatnonzero(placed.links == names.index(link)).tolist()
         if body in self.world.plane_names:
             plane = self._planes[self.world.plane_names.index(body)]
-            gaps = placed.plane_gaps(plane) - self._padding
-            return float(np.min(gaps[rows], initial=math.inf))
-        if body in names:
-            others = np.flatnonzero(placed.links == names.index(body))
-            return min(
-                (self._link_gap(int(i), int(j)) for i in rows for j in others), default=math.inf
-            )
-        owner = self._owners()
-        return min(
-            (
-                self._gap(int(i), b, int(owner[i])) - float(self._padding[i])
-                for b, found in enumerate(self.surfaces.bodies)
-                if found.name == body
-                for i in rows
-            ),
-            default=math.inf,
-        )
+            gaps = (placed.plane_gaps(plane) - self._padding)[rows].tolist()
+        elif body in names:
+            others = np.flatnonzero(placed.links == names.index(body)).tolist()
+            gaps = [self._link_gap(i, j) for i in rows for j in others]
+        else:
+            owner = self._owners()
+            own = [b for b, found in enumerate(self.surfaces.bodies) if found.name == body]
+            gaps = [self._gap(i, b, int(owner[i])) - self._padding[i] for b in own for i in rows]
+        return float(min(gaps, default=math.inf))
 
     def allows(self, link: str, body: str) -> bool:
         """Return `MeshChecker.allows`."""
-        object_ids = [f"object:{i}" for i in self.world.map.object_ids]
-        if body not in object_ids:
-            return False
-        row = self.placed.robot.link_names.index(link)
-        return bool(self._allowed[row, 1 + object_ids.index(body)])
+        names = ["", *(f"object:{i}" for i in self.world.map.object_ids)]
+        column = names.index(body) if body in names else 0
+        return bool(self._allowed[self.placed.robot.link_names.index(link), column])
 
     # --- what touches what ---------------------------------------------------------
 
@@ -198,7 +174,7 @@ class Queries:
     def _holds(self, i: int, points: Float[np.ndarray, "w 3"]) -> bool:
         """Whether a closed link mesh holds one of some world points: hollow, it cuts nothing."""
         solid = self.solids[i]
-        if solid.mesh is None:
+        if not solid.closed:
             return False
         near = points[np.linalg.norm(points - self.placed.centers[i], axis=1) <= solid.radius]
         return any(solid.holds(point) for point in self.placed.to_link(i, near))
@@ -212,11 +188,9 @@ class Queries:
 
     def _touches_points(self) -> bool:
         """Whether a moving solid comes too near to an observed point."""
-        points, placed = self._points, self.placed
+        points, need = self._points, self._need
         return points is not None and any(
-            True
-            for i in points.near(placed, self._need)
-            for _ in points.inside(placed, i, float(self._need[i]), self._allowed[placed.links[i]])
+            True for i in points.near(need) for _ in points.inside(i, float(need[i]))
         )
 
     def _unseen(self, margin: float) -> Iterator[tuple[int, str, Float[np.ndarray, "3"]]]:
@@ -229,18 +203,18 @@ class Queries:
     def _link_gap(self, i: int, j: int) -> float:
         """Distance between two solids of the robot; 0 where a mesh is touched."""
         a, b = self.placed.shape(i), self.placed.shape(j)
-        return _fcl.gap(a, b) if a.hollow or b.hollow else _fcl.signed_gap(a, b)
+        return fcl.gap(a, b) if a.hollow or b.hollow else fcl.signed_gap(a, b)
 
     def _gap(self, i: int, b: int, owner: int) -> float:
         """Distance of solid i to body b, padding aside; `owner` as of `_owners`."""
         body, shape = self.surfaces.bodies[b], self.placed.shape(i)
         if not (body.shape.hollow or shape.hollow):
-            return _fcl.signed_gap(body.shape, shape)
+            return fcl.signed_gap(body.shape, shape)
         inside = self._is_inside(i, b, owner)
         if shape.kind == "sphere":
-            way, _ = _fcl.point_distance(body.shape, self.placed.centers[i])
+            way, _ = fcl.point_distance(body.shape, self.placed.centers[i])
             return (-way if inside else way) - shape.size[0]
-        gap = _fcl.gap(body.shape, shape)
+        gap = fcl.gap(body.shape, shape)
         return -gap if inside or self._holds(i, body.witnesses) else gap
 
     def _is_inside(self, i: int, b: int, owner: int) -> bool:
@@ -282,17 +256,17 @@ class Queries:
         """How near solid i and body b are, or how deep in each other."""
         body, shape = self.surfaces.bodies[b], self.placed.shape(i)
         if shape.kind != "sphere" or not body.shape.hollow:
-            touch = _fcl.deepest_touch(body.shape, shape)
+            touch = fcl.deepest_touch(body.shape, shape)
             if touch is not None:
-                return -touch.depth, touch.position, touch.normal
+                return touch
         start = self.placed.witnesses[i]
         if body.shape.hollow and (shape.kind == "sphere" or inside):
-            way, point = _fcl.point_distance(body.shape, start)
+            way, point = fcl.point_distance(body.shape, start)
             out = point - start if inside else start - point
             normal = out / way if way > 1e-9 else _UP
             if shape.kind == "sphere":
                 return (-way if inside else way) - shape.size[0], point, normal
-            return -_fcl.gap(body.shape, shape), start, normal
+            return -fcl.gap(body.shape, shape), start, normal
         if self._holds(i, body.witnesses):  # a body inside a link's mesh
             return 0.0, body.witnesses[0], _UP
         return _apart(body.shape, shape)
@@ -301,10 +275,9 @@ class Queries:
         points = self._points
         if points is None:
             return
-        for i in points.near(self.placed, self._need):
+        for i in points.near(self._need):
             need = float(self._need[i])
-            found = points.deepest(self.placed, i, need, self._allowed[self.placed.links[i]])
-            for body, (gap, row) in found.items():
+            for body, (gap, row) in points.deepest(i, need).items():
                 place = points.points[row]
                 out = self.placed.centers[i] - place
                 length = float(np.linalg.norm(out))
@@ -326,14 +299,12 @@ class Queries:
                 continue
             # From the second link to the first: out of the contact for the one that is named.
             a, b = self.placed.shape(j), self.placed.shape(i)
-            touch = _fcl.deepest_touch(a, b)
-            found: Touch = (0.0, self.placed.witnesses[i], _UP)
-            if touch is not None:
-                found = (-touch.depth, touch.position, touch.normal)
-            elif _fcl.gap(a, b) <= self._self_margin:
-                found = _apart(a, b)
+            touch: Touch | None = fcl.deepest_touch(a, b)
+            if touch is None:
+                near = fcl.gap(a, b) <= self._self_margin
+                touch = _apart(a, b) if near else (0.0, self.placed.witnesses[i], _UP)
             other = self.placed.robot.link_names[self.solids[j].link]
-            yield self._contact(i, other, found, self._self_margin)
+            yield self._contact(i, other, touch, self._self_margin)
 
     def _contact(
         self, i: int, body: str, touch: Touch, required: float, detail: str = ""
@@ -347,14 +318,14 @@ class Queries:
         return contact(kind, name, body, touch, float(required), sphere, sure, detail)
 
 
-def _within(a: _fcl.Shape, b: _fcl.Shape, distance: float) -> bool:
+def _within(a: fcl.Shape, b: fcl.Shape, distance: float) -> bool:
     """Whether two shapes touch, or are at most so many metres apart."""
-    return _fcl.gap(a, b) <= distance if distance > 0.0 else _fcl.touches(a, b)
+    return fcl.gap(a, b) <= distance if distance > 0.0 else fcl.touches(a, b)
 
 
-def _apart(a: _fcl.Shape, b: _fcl.Shape) -> Touch:
+def _apart(a: fcl.Shape, b: fcl.Shape) -> Touch:
     """Two shapes that do not touch: the place is on the first, and the way out leads to the
     second."""
-    on_a, on_b = _fcl.nearest_points(a, b)
-    gap = _fcl.gap(a, b)
+    on_a, on_b = fcl.nearest_points(a, b)
+    gap = fcl.gap(a, b)
     return gap, on_a, (on_b - on_a) / gap if gap > 1e-9 else _UP

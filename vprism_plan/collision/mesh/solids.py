@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision._fcl import Shape, point_distance, point_within
-from vprism_plan.collision._packing import reach_table
+from vprism_plan.collision.mesh.fcl import Shape, point_distance, point_within
+from vprism_plan.collision.packing import reach_table
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot
 from vprism_plan.world.rasterize import winding_number
@@ -34,7 +34,7 @@ class Solid:
             no surface cuts it this point tells which side all of it is on.
         primitive: the shape as a formula; None for meshes.
         vertices: (v, 3) of a mesh, link frame; None for primitives.
-        mesh: closed `trimesh.Trimesh` whose inside counts, link frame; else None.
+        closed: whether it is a closed mesh, whose inside counts.
         hull: (f, 4) half-spaces n . x + d <= 0 around a mesh, link frame.
         triangles: (f, 3, 3) of its surface, link frame.
     """
@@ -49,12 +49,12 @@ class Solid:
     triangles: Float[np.ndarray, "f 3 3"]
     primitive: PrimitiveGeometry | None = None
     vertices: np.ndarray | None = None
-    mesh: Any = None
+    closed: bool = False
     hull: np.ndarray | None = None
 
     def holds(self, point: Float[np.ndarray, "3"]) -> bool:
         """Whether a point (link frame) is inside a closed mesh."""
-        return self.mesh is not None and abs(winding_number(point, self.triangles)) > 0.5
+        return self.closed and abs(winding_number(point, self.triangles)) > 0.5
 
     def bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Lower bound of the signed distance of points (link frame), metres; exact for
@@ -68,13 +68,7 @@ class Solid:
 def robot_solids(
     robot: Robot, links: LinkShapes, link_meshes: Mapping[str, Any] | None
 ) -> list[Solid]:
-    """Return the shapes of every link that carries collision spheres.
-
-    Args:
-        robot: the robot.
-        links: "geometry" (a mesh of `link_meshes`, else the URDF's meshes and primitives,
-            else the spheres) or "spheres".
-        link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres.
+    """Return the shapes of every link that carries collision spheres; see `MeshChecker`.
 
     Raises:
         ConfigError: `links` is neither.
@@ -123,9 +117,7 @@ def _own_meshes(robot: Robot, name: str) -> list[Any] | None:
     if not files or any(file.path is None for file in files):
         return None
     meshes = [file.mesh() for file in files]
-    if sum(mesh.body_count for mesh in meshes) > _MOST_PIECES:
-        return None
-    return meshes
+    return meshes if sum(mesh.body_count for mesh in meshes) <= _MOST_PIECES else None
 
 
 def _primitives(robot: Robot, link: int) -> list[Solid]:
@@ -133,13 +125,16 @@ def _primitives(robot: Robot, link: int) -> list[Solid]:
     return [_primitive(link, replace(solid, padding=0.0)) for solid in solids]
 
 
-def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
-    """Sphere centres in their links' frames: they do not depend on the configuration."""
+def sphere_centers(robot: Robot, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
+    """World centres of all collision spheres, metres."""
     import torch
 
-    q = robot.neutral
-    world = robot.sphere_centers(torch.from_numpy(q)).numpy()
-    poses = robot.link_poses(q)
+    return np.asarray(robot.sphere_centers(torch.from_numpy(q)).numpy())
+
+
+def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
+    """Sphere centres in their links' frames: they do not depend on the configuration."""
+    world, poses = sphere_centers(robot, robot.neutral), robot.link_poses(robot.neutral)
     of_link = [poses[robot.link_names[int(link)]] for link in robot.sphere_links]
     return np.array(
         [T[:3, :3].T @ (x - T[:3, 3]) for T, x in zip(of_link, world, strict=True)]
@@ -148,18 +143,8 @@ def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
 
 def _primitive(link: int, solid: PrimitiveGeometry, sphere: int = -1) -> Solid:
     shape = Shape(solid.kind, tuple(float(v) for v in solid.size))
-    center = np.array(solid.T_link[:3, 3])
-    return Solid(
-        link,
-        sphere,
-        shape,
-        np.array(solid.T_link),
-        center,
-        solid.bounding_radius(),
-        center,
-        solid.triangles(),
-        primitive=solid,
-    )
+    T, radius = np.array(solid.T_link), solid.bounding_radius()
+    return Solid(link, sphere, shape, T, T[:3, 3], radius, T[:3, 3], solid.triangles(), solid)
 
 
 def _mesh_solids(link: int, name: str, mesh: Any) -> list[Solid]:
@@ -171,27 +156,16 @@ def _mesh_solids(link: int, name: str, mesh: Any) -> list[Solid]:
             f"the mesh of link '{name}' is a {type(mesh).__name__} with {len(faces)} triangles; "
             "it must be a trimesh.Trimesh with finite vertices and at least one triangle"
         )
-    solids = []
-    for piece in mesh.split(only_watertight=False):
-        points = np.asarray(piece.vertices, dtype=np.float64)
-        center = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        radius = float(np.linalg.norm(points - center, axis=1).max())
-        solids.append(
-            Solid(
-                link,
-                -1,
-                Shape("mesh", mesh=piece),
-                np.eye(4),
-                center,
-                radius,
-                points[0],
-                points[np.asarray(piece.faces)],
-                vertices=points,
-                mesh=piece if piece.is_watertight else None,
-                hull=_hull(points),
-            )
-        )
-    return solids
+    return [_piece(link, piece) for piece in mesh.split(only_watertight=False)]
+
+
+def _piece(link: int, piece: Any) -> Solid:
+    points = np.asarray(piece.vertices, dtype=np.float64)
+    center = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = float(np.linalg.norm(points - center, axis=1).max())
+    shape, triangles = Shape("mesh", mesh=piece), points[np.asarray(piece.faces)]
+    own = {"vertices": points, "closed": piece.is_watertight, "hull": _hull(points)}
+    return Solid(link, -1, shape, np.eye(4), center, radius, points[0], triangles, **own)
 
 
 def _hull(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "f 4"]:
@@ -313,10 +287,8 @@ class PlacedSolids:
         solid = self.solids[i]
         if solid.vertices is not None:
             T = self._link_poses[self._row[i]]
-            return (
-                T[:3, :3] @ solid.vertices[np.argmin(solid.vertices @ (T[:3, :3].T @ normal))]
-                + T[:3, 3]
-            )
+            lowest = np.argmin(solid.vertices @ (T[:3, :3].T @ normal))
+            return T[:3, :3] @ solid.vertices[lowest] + T[:3, 3]
         local = self.R[i].T @ normal
         point = -self._balls[i] * local - np.sign(local) * self._halves[i]
         across = np.hypot(local[0], local[1])
@@ -326,13 +298,9 @@ class PlacedSolids:
 
     def pairs(self) -> Int[np.ndarray, "p 2"]:
         """Pairs of solids of the link pairs that the robot tests against each other."""
-        of_link = {link: np.flatnonzero(self.links == link) for link in np.unique(self.links)}
-        empty = np.empty(0, dtype=np.int64)
-        rows = [
-            pair
-            for a, b in self.robot.collision_pairs
-            for pair in itertools.product(of_link.get(a, empty), of_link.get(b, empty))
-        ]
+        of_link = [np.flatnonzero(self.links == k) for k in range(len(self.robot.link_names))]
+        pairs = (itertools.product(of_link[a], of_link[b]) for a, b in self.robot.collision_pairs)
+        rows = list(itertools.chain.from_iterable(pairs))
         return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
     def motion_bound(self, delta: Float[np.ndarray, "dof"]) -> float:

@@ -8,7 +8,6 @@ its figures for a sphere that overlaps a mesh (depth and distance are garbage th
 distance from the sphere's centre is exact instead), and its signed distance.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -38,21 +37,6 @@ def fcl() -> Any:
     return module
 
 
-@dataclass(frozen=True)
-class Touch:
-    """One place where two shapes touch.
-
-    Attributes:
-        depth: metres; see the function that returns it.
-        position: (3,) world.
-        normal: (3,) unit vector that leads from the first shape to the second.
-    """
-
-    depth: float
-    position: Float[np.ndarray, "3"]
-    normal: Float[np.ndarray, "3"]
-
-
 class Shape:
     """A shape FCL can be asked about, at a pose that can be changed.
 
@@ -68,7 +52,7 @@ class Shape:
         self.normals: np.ndarray | None = None
         self.body = fcl().CollisionObject(self._geometry(mesh))
         self._rotation = np.eye(3)
-        self._center = np.zeros(3)
+        self.center = np.zeros(3)  # where its own origin is, world frame
 
     def _geometry(self, mesh: Any) -> Any:
         module = fcl()
@@ -94,18 +78,12 @@ class Shape:
 
     def place(self, R: Float[np.ndarray, "3 3"], t: Float[np.ndarray, "3"]) -> None:
         """Move the shape to a pose in the world."""
-        self._rotation = R
-        self._center = t
+        self._rotation, self.center = R, t
         self.body.setTransform(fcl().Transform(R, t))
-
-    @property
-    def center(self) -> Float[np.ndarray, "3"]:
-        """Where the shape's own origin is, world frame."""
-        return self._center
 
     def to_world(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """Move a point of the shape's own frame along with it."""
-        return self._rotation @ point + self._center
+        return self._rotation @ point + self.center
 
     def normal_of(self, face: int) -> Float[np.ndarray, "3"]:
         """Outward normal of a triangle, world frame."""
@@ -145,7 +123,7 @@ def signed_gap(a: Shape, b: Shape) -> float:
     FCL's own signed distance errs by up to 0.2 mm; its distance and its depth do not.
     """
     touch = deepest_touch(a, b)
-    return gap(a, b) if touch is None else -touch.depth
+    return gap(a, b) if touch is None else touch[0]
 
 
 def point_distance(
@@ -186,8 +164,11 @@ def nearest_points(a: Shape, b: Shape) -> tuple[Float[np.ndarray, "3"], Float[np
     return first, second
 
 
-def deepest_touch(a: Shape, b: Shape) -> Touch | None:
-    """Return where two shapes intersect most, or None.
+def deepest_touch(
+    a: Shape, b: Shape
+) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
+    """Return where two shapes intersect most, or None: minus the depth (metres), where, and the
+    unit vector that leads from the first to the second, world.
 
     Between solids the depth is the way out; for a sphere and a mesh, how far the surface
     reaches into the sphere. For other shapes and a mesh it is FCL's figure for the deepest
@@ -211,4 +192,4 @@ def deepest_touch(a: Shape, b: Shape) -> Touch | None:
     mesh = next((shape for shape in (a, b) if shape.hollow), None)
     if ball is not None and mesh is not None:
         depth = max(0.0, ball.size[0] - point_distance(mesh, ball.center)[0])
-    return Touch(depth, np.array(found.pos, dtype=np.float64), normal)
+    return -depth, np.array(found.pos, dtype=np.float64), normal

@@ -16,19 +16,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vprism_plan.collision import _explain, _fcl
-from vprism_plan.collision._mesh_queries import Queries
-from vprism_plan.collision._mesh_world import MeshWorld
-from vprism_plan.collision._solids import LinkShapes, PlacedSolids, robot_solids
-from vprism_plan.collision.comparison import causes_between
-from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.contacts import contact_rules
-from vprism_plan.collision.mesh_reports import PathFinding, PathOpinion
-from vprism_plan.collision.protocols import BakedWorld, Numbers
+from vprism_plan.collision import explain
+from vprism_plan.collision.config import CheckerConfig, contact_rules
+from vprism_plan.collision.inputs import Numbers, configuration, configurations
+from vprism_plan.collision.mesh.comparison import PathFinding, PathOpinion, causes_between
+from vprism_plan.collision.mesh.fcl import fcl
+from vprism_plan.collision.mesh.queries import Queries
+from vprism_plan.collision.mesh.solids import LinkShapes, PlacedSolids, robot_solids, sphere_centers
+from vprism_plan.collision.mesh.world import MeshWorld
 from vprism_plan.collision.reports import Contact, MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import Robot
-from vprism_plan.robots.kinematics import joint_values
 
 _MAX_CONFIGURATIONS = 1_000_000
 
@@ -80,7 +78,7 @@ class MeshChecker:
 
     def __init__(
         self,
-        world: BakedWorld,
+        world: Any,
         robot: Robot,
         config: CheckerConfig | None = None,
         *,
@@ -90,13 +88,16 @@ class MeshChecker:
         step: float = 0.005,
         seen: bool = True,
     ) -> None:
-        _fcl.fcl()
+        fcl()
         if not (math.isfinite(step) and step >= 1e-5):
             raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
-        self._made: Callable[[], MeshChecker] = partial(
-            MeshChecker, world, robot, config, links=links, link_meshes=link_meshes,
-            resolution=resolution, step=step, seen=seen,
-        )  # fmt: skip
+        made: dict[str, Any] = {
+            "links": links,
+            "link_meshes": link_meshes,
+            "resolution": resolution,
+        }
+        made |= {"step": step, "seen": seen}
+        self._made: Callable[[], MeshChecker] = partial(MeshChecker, world, robot, config, **made)
         if hasattr(world, "for_base"):
             world = world.for_base(robot.base_pose[:3, 3])
         self.world = world
@@ -148,8 +149,7 @@ class MeshChecker:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is usable but odd about the world and the robot; every verdict carries it."""
-        found = (*getattr(self.world, "warnings", ()), *getattr(self.robot, "warnings", ()))
-        return tuple(dict.fromkeys(found))
+        return explain.warnings_of(self.world, self.robot)
 
     # --- configurations ----------------------------------------------------------
 
@@ -162,18 +162,20 @@ class MeshChecker:
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        return self.is_valid_buffer(self._configuration(q))
+        return self.is_valid_buffer(configuration(self.robot, q))
 
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
         """`is_valid` without looking at the shape."""
-        if _explain.limit_contacts(self.robot, q):
+        if explain.limit_contacts(self.robot, q):
             return False
         self.placed.place(q)
         return not self._queries.collides()
 
     def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
         """Return `is_valid` for each row of Q (n, dof)."""
-        return np.array([self.is_valid_buffer(q) for q in self._configurations(Q)], dtype=bool)
+        return np.array(
+            [self.is_valid_buffer(q) for q in configurations(self.robot, Q)], dtype=bool
+        )
 
     def clearance(self, q: Numbers) -> float:
         """Return the distance from the moving links to the nearest surface, metres.
@@ -196,13 +198,15 @@ class MeshChecker:
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return `clearance` for each row of Q (n, dof), metres."""
-        return np.array([self.clearance(q) for q in self._configurations(Q)], dtype=np.float64)
+        return np.array(
+            [self.clearance(q) for q in configurations(self.robot, Q)], dtype=np.float64
+        )
 
     def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
         found = []
-        for q in self._configurations(Q):
-            self.placed.place(self.robot.check_configuration(q))
+        for q in configurations(self.robot, Q, finite=True):
+            self.placed.place(q)
             found.append(self._queries.self_clearance())
         return np.array(found, dtype=np.float64)
 
@@ -212,24 +216,16 @@ class MeshChecker:
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        q = self._configuration(q)
-        return _explain.report(
-            self,
-            q,
-            lambda: list(self.contacts(q)),
-            tuple,
-            lambda: self._permitted(q),
-            lambda: self._sphere_centers(q),
-        )
+        q = configuration(self.robot, q)
+        centers = partial(sphere_centers, self.robot)
+        return explain.report(self, q, self.contacts, self._permitted, centers)
 
     def contacts(self, q: Numbers) -> tuple[Contact, ...]:
         """Return every reason to refuse q: the deepest contact of each link and body.
 
-        Depths are exact for half-spaces, for spheres against anything, and between
-        primitives. Where a box, cylinder or mesh crosses a mesh's surface, the depth is
-        FCL's figure for the deepest triangle: how far the solid reaches through it, not
-        the way out. Of a solid wholly inside it is the gap to the surface. Normals of
-        meshes are those of the triangle.
+        Depths are exact where those of `clearance` are. Where a box, cylinder or mesh crosses a
+        mesh's surface, the depth is FCL's figure for the deepest triangle: how far the solid
+        reaches through it, not the way out. Normals of meshes are those of the triangle.
 
         Returns:
             Deepest first; empty exactly if `is_valid(q)`. `sphere` is -1 for solids.
@@ -237,12 +233,12 @@ class MeshChecker:
         Raises:
             RobotError: q does not have shape (dof,).
         """
-        q = self._configuration(q)
-        reasons = _explain.limit_contacts(self.robot, q)
+        q = configuration(self.robot, q)
+        reasons = explain.limit_contacts(self.robot, q)
         if np.isfinite(q).all():
             self.placed.place(q)
             reasons += self._queries.contacts()
-        return tuple(sorted(reasons, key=lambda contact: -contact.depth))
+        return tuple(explain.by_depth(reasons))
 
     def link_distance(self, q: Numbers, link: str, body: str) -> float:
         """Return the distance from one link to one body, metres, as `clearance` states it.
@@ -256,8 +252,7 @@ class MeshChecker:
         Raises:
             RobotError: the configuration or the link is not one of the robot's.
         """
-        q = self.robot.check_configuration(q)
-        self.placed.place(q)
+        self.placed.place(self.robot.check_configuration(q))
         if link not in self.robot.link_names:
             raise RobotError(f"no link {link!r} to check; links: {list(self.robot.link_names)}")
         return self._queries.link_distance(link, body)
@@ -279,7 +274,8 @@ class MeshChecker:
             RobotError: an end does not have shape (dof,).
             ConfigError: the step asks for too many configurations.
         """
-        return self.check_motion_buffer(self._configuration(qa), self._configuration(qb))
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
+        return self.check_motion_buffer(qa, qb)
 
     def check_motion_buffer(
         self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
@@ -289,7 +285,7 @@ class MeshChecker:
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
         """Return the verdict on an edge, how far apart it was looked at, and the reason."""
-        qa, qb = self._configuration(qa), self._configuration(qb)
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
         checked, refused, state = 0, None, None
         for t, q in self._between(qa, qb):
             checked += 1
@@ -317,12 +313,9 @@ class MeshChecker:
             RobotError: path does not have shape (T, dof), T >= 1, or is not finite.
             ConfigError: the step asks for too many configurations.
         """
-        rows = joint_values(path, self.robot, "a path")
-        if rows.ndim != 2 or len(rows) == 0:
-            raise RobotError(
-                f"path has shape {rows.shape}; it must be (T, {self.robot.dof}) with T >= 1"
-            )
-        rows = np.array([self.robot.check_configuration(row) for row in rows])
+        rows = configurations(self.robot, path, finite=True)
+        if len(rows) == 0:
+            raise RobotError(f"a path has shape {rows.shape}; it needs at least one waypoint")
         ends = pairwise(rows) if len(rows) > 1 else iter([(rows[0], rows[0])])
         findings, checked = [], 0
         for edge, (qa, qb) in enumerate(ends):
@@ -379,28 +372,6 @@ class MeshChecker:
                 yield float(fractions[m]), qa + fractions[m] * (qb - qa)
             spans = [span for a, m, b in middles for span in ((a, m), (m, b))]
 
-    # --- small helps -------------------------------------------------------------
-
-    def _configuration(self, q: Numbers) -> Float[np.ndarray, "dof"]:
-        array = joint_values(q, self.robot, "a configuration")
-        if array.shape != (self.robot.dof,):
-            return self.robot.check_configuration(array)  # which says what is wrong
-        return array
-
-    def _configurations(self, Q: Numbers) -> Float[np.ndarray, "n dof"]:
-        array = joint_values(Q, self.robot, "configurations")
-        if array.ndim != 2 or array.shape[1] != self.robot.dof:
-            raise RobotError(
-                f"configurations have shape {array.shape}; {self.robot.name} needs "
-                f"(n, {self.robot.dof}): {', '.join(self.robot.joint_names)}"
-            )
-        return array
-
     def _permitted(self, q: Float[np.ndarray, "dof"]) -> list[Contact]:
         self.placed.place(q)
         return self._queries.permitted()
-
-    def _sphere_centers(self, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
-        import torch
-
-        return np.asarray(self.robot.sphere_centers(torch.from_numpy(q)).numpy())

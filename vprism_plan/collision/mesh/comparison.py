@@ -1,0 +1,370 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Where the distance field and the meshes disagree, and why: of configurations and of paths."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from vprism_plan.collision.inputs import Numbers, configurations
+from vprism_plan.collision.mesh import fcl
+from vprism_plan.collision.mesh.seen import SEEN
+from vprism_plan.collision.mesh.solids import sphere_centers
+from vprism_plan.collision.reports import Contact
+
+_TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
+# Grid steps that the field may refuse beyond a surface: its interpolation gives up less than
+# one (half a cell's diagonal), its cover less than half.
+_INFLATION = 1.5
+CauseKind = Literal[
+    "conservative spheres", "margin", "voxel inflation", "occluded", "unobserved", "background",
+    "thin seen part", "too small for the mesh",
+    "solids outside spheres", "coarse mesh", "rounding", "edge tolerance", "missed by the field",
+    "seen by a camera",
+    "contact rules", "posterior risk", "unexplained",
+]  # fmt: skip
+
+_WHY: dict[CauseKind, str] = {
+    # the field refuses, meshes accept
+    "conservative spheres": "the link's spheres reach it, its solids do not",
+    "margin": "nothing touches, but the field's checker keeps a margin",
+    "voxel inflation": "the field's cells reach beyond the surface",
+    "occluded": "no camera saw it, and meshes touch nothing that they ask about",
+    "unobserved": "no camera looked there, and meshes touch nothing that they ask about",
+    "background": "its cells reach farther than the points of the unlabelled clutter",
+    "thin seen part": "its cells reach farther than the points of a part that the map smooths away",
+    "too small for the mesh": "the object has no surface on the mesh's lattice",
+    # meshes refuse, the field accepts
+    "solids outside spheres": "the link's spheres do not hold its solids",
+    "coarse mesh": "the mesh reaches beyond the level set",
+    "rounding": "the two differ by less than FCL's tolerance",
+    "edge tolerance": "the field refuses it, too, and accepted the edge within its tolerance",
+    "missed by the field": "the map, or the shadow of what was seen, says occupied and the field "
+    "says free",
+    "seen by a camera": "the checker missed what a camera saw there",
+    # either
+    "contact rules": "the two permit different contacts",
+    "posterior risk": "posterior worlds judge the objects",
+    "unexplained": "no known cause",
+}
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why one contact is refused by one checker and not by the other.
+
+    Attributes:
+        kind: the cause.
+        link: link in contact.
+        body: what it touches.
+        amount: metres: how far the solids stay from the surface ("conservative spheres"),
+            the spheres do ("margin", "voxel inflation"), or the depth of the contact.
+    """
+
+    kind: CauseKind
+    link: str
+    body: str
+    amount: float
+
+    def text(self) -> str:
+        """Return the cause as one phrase."""
+        return f"{self.link} and {self.body}: {self.kind} ({_WHY[self.kind]})"
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A configuration on which two checkers disagree.
+
+    Attributes:
+        index: row of the configurations that were compared.
+        field_valid: verdict of the checker on the distance field.
+        mesh_valid: verdict of the checker on meshes.
+        causes: one per contact of the checker that refuses, deepest first.
+    """
+
+    index: int
+    field_valid: bool
+    mesh_valid: bool
+    causes: tuple[Cause, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two checkers on the same configurations.
+
+    Attributes:
+        both_free: how many both accept.
+        both_refused: how many both refuse.
+        disagreements: the others.
+    """
+
+    both_free: int
+    both_refused: int
+    disagreements: tuple[Disagreement, ...]
+
+    @property
+    def field_refuses(self) -> tuple[Disagreement, ...]:
+        """What the field refuses and meshes accept: the price of being conservative."""
+        return tuple(d for d in self.disagreements if d.mesh_valid)
+
+    @property
+    def mesh_refuses(self) -> tuple[Disagreement, ...]:
+        """What meshes refuse and the field accepts: to be looked into."""
+        return tuple(d for d in self.disagreements if d.field_valid)
+
+    def counts(self) -> dict[str, int]:
+        """How many configurations each kind of cause has a part in."""
+        return dict(Counter(k for d in self.disagreements for k in {c.kind for c in d.causes}))
+
+    def text(self) -> str:
+        """Return the comparison in one line."""
+        kinds = ", ".join(f"{kind} {n}" for kind, n in sorted(self.counts().items()))
+        return (
+            f"{self.both_free} free and {self.both_refused} refused by both; field refuses "
+            f"{len(self.field_refuses)} that meshes accept, meshes refuse "
+            f"{len(self.mesh_refuses)} that the field accepts" + (f": {kinds}" if kinds else "")
+        )
+
+
+@dataclass(frozen=True)
+class PathFinding:
+    """A collision on an edge of a path.
+
+    Attributes:
+        edge: number of the edge; edge 0 leads from waypoint 0 to waypoint 1.
+        fraction: where on the edge, 0 to 1; the first of the configurations looked at.
+        configuration: the joint values there.
+        contacts: what touches what.
+        causes: why another checker accepted it, if one was named.
+    """
+
+    edge: int
+    fraction: float
+    configuration: tuple[float, ...]
+    contacts: tuple[Contact, ...]
+    causes: tuple[Cause, ...] = ()
+
+    def text(self) -> str:
+        """Return the finding in one line."""
+        reasons = "; ".join(contact.text() for contact in self.contacts)
+        why = "; ".join(cause.text() for cause in self.causes)
+        why = f" (why: {why})" if why else ""
+        return f"edge {self.edge} at {self.fraction:.3f}: {reasons}{why}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return {
+            **vars(self),
+            "configuration": list(self.configuration),
+            "contacts": [contact.to_dict() for contact in self.contacts],
+            "causes": [dict(vars(cause)) for cause in self.causes],
+        }
+
+
+@dataclass(frozen=True)
+class PathOpinion:
+    """Whether a path is free of surfaces, at discrete configurations.
+
+    Attributes:
+        valid: the verdict.
+        step: metres that no point of the robot exceeds between two configurations.
+        configurations: how many were checked.
+        findings: one per refused edge.
+        judge: who gives the opinion.
+    """
+
+    valid: bool
+    step: float
+    configurations: int
+    findings: tuple[PathFinding, ...] = field(default=())
+    judge: str = "MeshChecker"
+
+    def text(self) -> str:
+        """Return the opinion in one line."""
+        how = f"{self.configurations} configurations, {1000 * self.step:g} mm apart"
+        if self.valid:
+            return f"{self.judge} agrees ({how})"
+        return f"{self.judge} disagrees ({how}): " + "; ".join(f.text() for f in self.findings)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready keys."""
+        return {**vars(self), "findings": [found.to_dict() for found in self.findings]}
+
+
+def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
+    """Compare the verdicts of the field and of meshes, and name a cause for every difference.
+
+    Args:
+        checker: a `CollisionChecker`.
+        mesh_checker: the second opinion, on the same world and robot.
+        Q: (n, dof) finite configurations.
+
+    Returns:
+        The comparison. A disagreement has one cause per contact of the checker that
+        refuses: each of them alone would have made the difference.
+
+    Raises:
+        RobotError: Q does not have shape (n, dof) or is not finite.
+    """
+    both, neither, found = 0, 0, []
+    for index, q in enumerate(configurations(mesh_checker.robot, Q, finite=True)):
+        by_field, by_mesh = bool(checker.is_valid(q)), mesh_checker.is_valid(q)
+        if by_field == by_mesh:
+            both += by_field
+            neither += not by_field
+            continue
+        causes = causes_between(checker, mesh_checker, q)
+        found.append(Disagreement(index, by_field, by_mesh, causes))
+    return Comparison(both, neither, tuple(found))
+
+
+def causes_between(
+    checker: Any, mesh_checker: Any, q: Float[np.ndarray, "dof"]
+) -> tuple[Cause, ...]:
+    """Name why the two disagree on q; "edge tolerance" if both refuse it, empty if none does."""
+    by_field = checker.explain(q)
+    touching = mesh_checker.contacts(q)
+    if by_field.valid:
+        return tuple(_of_mesh(checker, mesh_checker, contact, q) for contact in touching)
+    if touching:
+        return tuple(Cause("edge tolerance", c.link, c.body, c.depth) for c in touching)
+    return tuple(_of_field(checker, mesh_checker, contact, q) for contact in by_field.contacts)
+
+
+# --- the field refuses, meshes accept ------------------------------------------------
+
+
+def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
+    kind: Any
+    amount = contact.depth
+    if contact.body in {"occluded", "unobserved", "background"}:
+        kind = contact.body
+    elif contact.kind == "risk":
+        kind = "posterior risk"
+    elif contact.kind == "object" and meshes.allows(contact.link, contact.body):
+        kind = "contact rules"
+    elif contact.kind == "self" or contact.body in checker.world.plane_names:
+        # Both are exact for spheres: what is left is the margin, or what spheres add.
+        own = contact.kind == "self"
+        margin = checker.config.self_margin if own else checker.config.margin
+        kind = "conservative spheres" if contact.depth > margin else "margin"
+        amount = meshes.link_distance(q, contact.link, contact.body)
+    elif contact.kind in {"object", "known"} and contact.sphere >= 0:
+        kind, amount = _of_surface(checker, meshes, contact, q)
+    else:
+        kind = "unexplained"
+    return Cause(kind, contact.link, contact.body, float(amount))
+
+
+def _of_surface(
+    checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]
+) -> tuple[CauseKind, float]:
+    """Cause and amount where the field refuses a sphere for an object or known geometry."""
+    margin = float(checker.config.margin)
+    center = sphere_centers(meshes.robot, q)[contact.sphere]
+    radius = float(meshes.robot.sphere_radii[contact.sphere])
+    gap = _ball_gap(meshes, center, radius, contact.body)
+    left = meshes.link_distance(q, contact.link, contact.body)
+    if gap <= _TOLERANCE and left > gap + _TOLERANCE:
+        return "conservative spheres", left
+    if gap <= margin:
+        return "margin", gap
+    if contact.kind == "object":
+        if not _level_set_refuses(checker, center, radius):
+            return "thin seen part", contact.depth
+        if contact.body not in {body.name for body in meshes.surfaces.bodies}:
+            return "too small for the mesh", contact.depth
+    within = margin + _INFLATION * float(checker.world.field.spacing)
+    return "voxel inflation" if gap <= within else "unexplained", gap
+
+
+def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named: str) -> float:
+    """Signed distance of a ball to the surfaces of the kind that a contact names.
+
+    For an object: to any of them, since the field names the nearest to a grid node.
+    """
+    surfaces = meshes.surfaces
+    objects = named.startswith("object:")
+    inside = objects and surfaces.object_at(center[None])[0] > 0
+    best = math.inf
+    for body in surfaces.bodies:
+        if body.name != named and not (objects and body.class_index):
+            continue
+        if not body.shape.hollow:
+            ball = fcl.Shape("sphere", (radius,))
+            ball.place(np.eye(3), center)
+            best = min(best, fcl.signed_gap(body.shape, ball))
+            continue
+        way, _ = fcl.point_distance(body.shape, center)
+        hidden = inside if objects else body.contains(center)
+        best = min(best, (-way if hidden else way) - radius)
+    return best
+
+
+def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: float) -> bool:
+    """Whether the objects' level sets alone, without thin seen parts, refuse a sphere."""
+    world = checker.world
+    nearest = min(
+        float(world.object_field(i).lower_bound(center[None])[0]) for i in world.map.object_ids
+    )
+    return nearest - radius <= checker.config.margin
+
+
+# --- meshes refuse, the field accepts ------------------------------------------------
+
+
+def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
+    kind: CauseKind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
+    links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
+    if contact.position is None:
+        kind = "unexplained"  # a joint limit: both know the same
+    elif contact.kind == "object" and _field_allows(checker, contact):
+        kind = "contact rules"
+    elif contact.kind == "object" and contact.detail != SEEN and _draws_judge(checker):
+        kind = "posterior risk"
+    elif contact.depth <= _TOLERANCE and contact.kind not in ("occluded", "unobserved"):
+        kind = "rounding"
+    elif contact.sphere < 0 and not _in_spheres(meshes, q, links, contact):
+        kind = "solids outside spheres"
+    elif contact.kind == "object" and not contact.detail and not _in_level_set(checker, contact):
+        kind = "coarse mesh"
+    return Cause(kind, contact.link, contact.body, contact.depth)
+
+
+def _draws_judge(checker: Any) -> bool:
+    """Whether draws judge the objects in place of the level set: below its level, both do."""
+    bound = checker.config.max_risk
+    return bound is not None and bound >= checker.world.config.level
+
+
+def _in_level_set(checker: Any, contact: Contact) -> bool:
+    """Whether the map calls the point of contact, or the deepest one behind it, occupied."""
+    point = np.array(contact.position)
+    deepest = point - max(0.0, contact.depth - contact.required) * np.array(contact.normal)
+    occupied = np.asarray(checker.world.map.occupancy(np.stack([point, deepest])))
+    return bool((occupied >= checker.world.config.level).any())
+
+
+def _field_allows(checker: Any, contact: Contact) -> bool:
+    """Whether the field's checker lets the link touch the object."""
+    object_id = int(contact.body.split(":", 1)[1])
+    return any(
+        object_id in ids and contact.link in checker.robot.links_of(name)
+        for name, ids in checker.config.allowed_contacts.items()
+    )
+
+
+def _in_spheres(
+    meshes: Any, q: Float[np.ndarray, "dof"], links: tuple[str, ...], contact: Contact
+) -> bool:
+    """Whether the collision spheres of each link are as near to the place of a contact as the
+    solids are, to FCL's tolerance."""
+    point, apart = np.array(contact.position), max(0.0, contact.required - contact.depth)
+    robot = meshes.robot
+    away = np.linalg.norm(sphere_centers(robot, q) - point, axis=1)
+    held = away <= robot.sphere_radii + apart + _TOLERANCE
+    owners = {robot.link_names[int(link)] for link in robot.sphere_links[held]}
+    return owners >= set(links)
