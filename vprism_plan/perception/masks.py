@@ -13,11 +13,10 @@ from jaxtyping import Bool, Float, Int32
 from scipy import ndimage
 
 from vprism_plan.perception._fringes import WIDE, MaskView, fringe_pixels
-from vprism_plan.perception._ransac import least_squares_plane, refine
-from vprism_plan.perception.camera import depth_sigma, pixel_rays
+from vprism_plan.perception.camera import depth_sigma, inlier_band, pixel_rays
 from vprism_plan.perception.observation import Observation
-from vprism_plan.perception.plane import Plane
-from vprism_plan.perception.plane_fitting import inlier_band, standing_on
+from vprism_plan.perception.plane import Plane, least_squares_plane, refine
+from vprism_plan.perception.plane_fitting import standing_on
 
 # Values that data sets use for "unknown" or "all the rest".
 _VOID = (255, 65535, 2**31 - 1)

@@ -9,12 +9,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception._ransac import least_squares_plane
-from vprism_plan.perception.camera import pixel_rays
+from vprism_plan.perception.camera import inlier_band, pixel_rays
 from vprism_plan.perception.masks import mend
 from vprism_plan.perception.observation import Observation
-from vprism_plan.perception.plane import Plane
-from vprism_plan.perception.plane_fitting import inlier_band
+from vprism_plan.perception.plane import Plane, least_squares_plane
 from vprism_plan.perception.several_views import agree
 
 _TILTED, _NO_TABLE = 15.0, 45.0  # degrees off the world's z: named, refused

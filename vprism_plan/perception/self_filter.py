@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan.errors import ConfigError, ObservationError
-from vprism_plan.perception._image_graph import depth_noise, flying_pixels, surface_image
-from vprism_plan.perception._validation import to_numpy
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import (
     backproject,
     invert_transform,
     project,
+    stereo_noise,
     transform_points,
 )
-from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.image_graph import flying_pixels, surface_image
+from vprism_plan.perception.observation import Observation, to_numpy
 
 logger = logging.getLogger(__name__)
 
@@ -177,7 +177,7 @@ def ignore_self(
             "<collision> geometry or a mesh"
         )
     inner = solid.inner
-    noise = 3.0 * depth_noise(_in_camera(observation, inner[:, :3])[:, 2])
+    noise = 3.0 * stereo_noise(_in_camera(observation, inner[:, :3])[:, 2])
     marked = _with_balls(marked, inner[:, :3], inner[:, 3] + padding + noise, inner[:, 3])
     if room is not None:
         places, sizes = to_numpy(centers, "centers"), to_numpy(robot.sphere_radii, "radii")
