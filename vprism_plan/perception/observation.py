@@ -212,38 +212,34 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
             f"depth is {depth.dtype}, so it holds raw sensor units; give metres as float: "
             "depth * scale (0.001 for millimetres)"
         )
+    if depth.dtype.kind != "f":
+        raise ObservationError(f"depth is {depth.dtype}; it must be float32 or float64 metres")
     if depth.dtype not in (np.float32, np.float64):
-        if depth.dtype.kind != "f":
-            raise ObservationError(f"depth is {depth.dtype}; it must be float32 or float64 metres")
         depth = depth.astype(np.float32 if depth.dtype.itemsize <= 4 else np.float64)
-    _check_signs(depth)
+    negative = depth < 0
+    if negative.any():
+        row, col = np.argwhere(negative)[0]
+        infinite = depth[row, col] <= -_INFINITE
+        raise ObservationError(
+            f"depth is {'-inf' if infinite else format(depth[row, col], 'g')} at row {row}, column "
+            f"{col} ({int(negative.sum())} negative pixels); it must be positive metres along the "
+            "optical axis, or 0 where there is no return"
+            + ("; np.nan_to_num(depth, posinf=0, neginf=0) says so" if infinite else "")
+        )
     depth[~(depth < _INFINITE)] = 0.0  # NaN compares false
     valid = depth[depth > 0]
     _check_scale(valid, max_range)
     beyond = depth > max_range
+    depth = np.ascontiguousarray(depth)
     if not beyond.any():
-        return np.ascontiguousarray(depth), ()
+        return depth, ()
     found = (
         f"{int(beyond.sum())} depth returns ({100 * beyond.sum() / valid.size:.2g} %) lie beyond "
         f"max_range = {max_range:g} m, the farthest at {valid.max():.4g} m; they count as no "
         "return: is it the sensor's value for 'no data'? If they are real, raise max_range"
     )
     depth[beyond] = 0.0
-    return np.ascontiguousarray(depth), (found,)
-
-
-def _check_signs(depth: np.ndarray) -> None:
-    bad = depth < 0
-    if not bad.any():
-        return
-    row, col = np.argwhere(bad)[0]
-    infinite = depth[row, col] <= -_INFINITE
-    raise ObservationError(
-        f"depth is {'-inf' if infinite else format(depth[row, col], 'g')} at row {row}, column "
-        f"{col} ({int(bad.sum())} negative pixels); it must be positive metres along the optical "
-        "axis, or 0 where there is no return"
-        + ("; np.nan_to_num(depth, posinf=0, neginf=0) says so" if infinite else "")
-    )
+    return depth, (found,)
 
 
 def _check_scale(valid: np.ndarray, max_range: float) -> None:
@@ -295,30 +291,38 @@ def check_labels(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.ascontiguousarray(labels, dtype=np.int32)
 
 
-def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a (3, 3) float64 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
-    matrix = to_numpy(value, "intrinsics")
-    if matrix.shape != (3, 3) or matrix.dtype.kind not in "fiu":
+def _finite_matrix(value: Any, name: str, size: int, what: str) -> np.ndarray:
+    """Return a square, finite float64 matrix whose last row is that of an identity."""
+    matrix = to_numpy(value, name)
+    if matrix.shape != (size, size) or matrix.dtype.kind not in "fiu":
         raise ObservationError(
-            f"intrinsics have shape {matrix.shape} and type {matrix.dtype}; they must be the "
-            "3x3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+            f"{name}: shape {matrix.shape} and type {matrix.dtype}; it must be {what}"
         )
     matrix = matrix.astype(np.float64)
     if not np.isfinite(matrix).all():
-        raise ObservationError(f"intrinsics are not finite: {matrix.tolist()}")
-    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    if not np.allclose(matrix[2], [0.0, 0.0, 1.0], atol=1e-9):
+        raise ObservationError(f"{name}: not finite: {matrix.tolist()}")
+    last = np.eye(size)[-1].astype(int).tolist()
+    if not np.allclose(matrix[-1], last, atol=1e-9):
         raise ObservationError(
-            f"intrinsics' last row is {matrix[2].tolist()}; a pinhole matrix ends in [0, 0, 1]"
+            f"{name}: its last row is {matrix[-1].tolist()}; it must be {last} (is the matrix "
+            "transposed?)"
         )
+    return matrix
+
+
+def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a (3, 3) float64 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
+    what = "the 3x3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    matrix = _finite_matrix(value, "intrinsics", 3, what)
+    (fx, skew, cx), (other_skew, fy, cy), _ = matrix
     if fx <= 0 or fy <= 0:
         raise ObservationError(
             f"intrinsics are singular: focal lengths fx = {fx:g}, fy = {fy:g} must be positive "
             "pixels"
         )
-    if abs(matrix[0, 1]) > 1e-6 * fx or abs(matrix[1, 0]) > 1e-6 * fx:
+    if max(abs(skew), abs(other_skew)) > 1e-6 * fx:
         raise ObservationError(
-            f"intrinsics have skew ({matrix[0, 1]:g}, {matrix[1, 0]:g}); only a pinhole camera "
+            f"intrinsics have skew ({skew:g}, {other_skew:g}); only a pinhole camera "
             "without skew is supported: rectify the image first"
         )
     matrix[0, 1] = matrix[1, 0] = 0.0
@@ -333,20 +337,8 @@ def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def check_pose(value: Any) -> np.ndarray:
     """Return a rigid (4, 4) float64 transform; small rounding is removed, more is an error."""
-    pose = to_numpy(value, "T_world_camera")
-    if pose.shape != (4, 4) or pose.dtype.kind not in "fiu":
-        raise ObservationError(
-            f"T_world_camera has shape {pose.shape} and type {pose.dtype}; it must be a 4x4 "
-            "rigid transform from camera to world coordinates, or None"
-        )
-    pose = pose.astype(np.float64)
-    if not np.isfinite(pose).all():
-        raise ObservationError(f"T_world_camera is not finite: {pose.tolist()}")
-    if not np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0], atol=1e-9):
-        raise ObservationError(
-            f"T_world_camera's last row is {pose[3].tolist()}; it must be [0, 0, 0, 1] (is the "
-            "matrix transposed?)"
-        )
+    what = "a 4x4 rigid transform from camera to world coordinates, or None"
+    pose = _finite_matrix(value, "T_world_camera", 4, what)
     rotation = pose[:3, :3]
     error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
     if error > _RIGID_TOLERANCE:
