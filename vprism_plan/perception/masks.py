@@ -191,18 +191,11 @@ def _furniture(view: Observation, value: int, ids: list[int], dropped: list[int]
     if length > _TABLE[0] and width > _TABLE[1] and upward:
         rest = np.isin(view.labels, [i for i in ids if i != value and i not in dropped])
         others = _some(view, rest & (view.depth > 0))
-        if _carries(plane, on, others) and _lowest(view, plane, count):
+        touch = np.percentile(plane.signed_distance(others), 5.0) if len(others) else np.inf
+        carries = touch < _TOUCH and standing_on(plane, on, others, 0.01).mean() > _CARRIED
+        if carries and _lowest(view, plane, count):
             return f"{what} that the other objects stand on"
     return ""
-
-
-def _carries(plane: Plane, on_plane: Points, objects: Float[np.ndarray, "m 3"]) -> bool:
-    """Whether the objects stand on a patch of a plane, and touch it."""
-    if not len(objects):
-        return False
-    standing = standing_on(plane, on_plane, objects, 0.01)
-    touch = float(np.percentile(plane.signed_distance(objects), 5.0))
-    return bool(standing.mean() > _CARRIED and touch < _TOUCH)
 
 
 def _lowest(view: Observation, plane: Plane, count: int) -> bool:
@@ -275,8 +268,8 @@ class _MaskView:
 
     def part(self, window: tuple[slice, slice]) -> "_MaskView":
         """Return a window of the images."""
-        images = (self.labels, self.depth, self.rays, self.slant, self.height, self.on_plane)
-        return _MaskView(*(image[window] for image in images), self.pitch)
+        names = ("labels", "depth", "rays", "slant", "height", "on_plane")
+        return replace(self, **{name: getattr(self, name)[window] for name in names})
 
     def area(self, pixels: Pixels) -> float:
         """Area of level ground that some pixels show, m^2."""
@@ -299,7 +292,8 @@ def _mended(view: Observation, plane: Plane) -> tuple[Observation, list[str]]:
     number = np.where(image.labels > 0, np.searchsorted(ids, image.labels) + 1, 0)
     too_wide: dict[int, int] = {}
     for value, box in zip(ids, ndimage.find_objects(number), strict=True):
-        window = tuple(slice(max(0, s.start - _RING), s.stop + _RING) for s in box)
+        rows, columns = (slice(max(0, s.start - _RING), s.stop + _RING) for s in box)
+        window = (rows, columns)
         part = image.part(window)
         own = part.labels == value
         pixels = int(own.sum())

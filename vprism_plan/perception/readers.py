@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from vprism_plan import _files
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.camera import Matrix, invert_transform, undistort
+from vprism_plan.perception.camera import invert_transform, undistort
 from vprism_plan.perception.observation import (
     DEFAULT_MAX_RANGE,
     Observation,
@@ -141,18 +141,17 @@ def _load_images(depth: Path, prefix: str) -> Observation:
     if pose is not None:
         pose = _matrix(pose, (4, 4), f"{camera}: 'T_world_camera'")
     labels, color = (depth.with_name(f"{prefix}{n}{depth.suffix}") for n in ("labels", "color"))
-    return _straight(
-        content,
-        camera,
-        raw * np.float64(scale),
-        _read_labels(labels) if labels.is_file() else None,
-        np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
-        pose,
-        _read_color(color) if color.is_file() else None,
-        plane=_plane(content.get("plane"), f"{camera}: 'plane'"),
-        robot_spheres=content.get("robot_spheres"),
-        max_range=_positive(content, "max_range", camera, DEFAULT_MAX_RANGE),
-    )
+    given = {
+        "depth": raw * np.float64(scale),
+        "labels": _read_labels(labels) if labels.is_file() else None,
+        "intrinsics": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
+        "T_world_camera": pose,
+        "color": _read_color(color) if color.is_file() else None,
+        "plane": _plane(content.get("plane"), f"{camera}: 'plane'"),
+        "robot_spheres": content.get("robot_spheres"),
+        "max_range": _positive(content, "max_range", camera, DEFAULT_MAX_RANGE),
+    }
+    return _straight(given, _read_distortion(content, camera))
 
 
 def _plane(value: Any, what: str) -> Plane | None:
@@ -187,15 +186,15 @@ def _load_bop(scene: Path, frame: int | None) -> Observation:
     if depth is None:
         raise ObservationError(f"{scene / 'depth' / stem}.png is missing")
     raw, color = _read_depth(depth), _existing(scene / "rgb" / stem, ".png", ".jpg")
-    return _straight(
-        camera,
-        path,
-        raw * (_positive(camera, "depth_scale", path, 1.0) * _MILLIMETRE),
-        _bop_labels(scene / "mask_visib", stem, raw.shape),
-        _matrix(camera["cam_K"], (3, 3), f"{path}: image {key} 'cam_K'"),
-        _bop_pose(camera, f"{path}: image {key}"),
-        None if color is None else _read_color(color),
-    )
+    what = f"{path}: image {key}"
+    given = {
+        "depth": raw * (_positive(camera, "depth_scale", path, 1.0) * _MILLIMETRE),
+        "labels": _bop_labels(scene / "mask_visib", stem, raw.shape),
+        "intrinsics": _matrix(camera["cam_K"], (3, 3), f"{what} 'cam_K'"),
+        "T_world_camera": _bop_pose(camera, what),
+        "color": None if color is None else _read_color(color),
+    }
+    return _straight(given, _read_distortion(camera, path))
 
 
 def _existing(stem: Path, *suffixes: str) -> Path | None:
@@ -236,25 +235,14 @@ def _bop_pose(camera: dict[str, Any], what: str) -> np.ndarray | None:
 
 
 # --------------------------------------------------------------------------------------- lens
-def _straight(
-    content: dict[str, Any],
-    path: Path,
-    depth: np.ndarray,
-    labels: np.ndarray | None,
-    intrinsics: Matrix,
-    pose: Any,
-    color: np.ndarray | None,
-    **more: Any,
-) -> Observation:
-    """Return the observation with the lens's distortion that its camera file states undone."""
-    lens = _read_distortion(content, path)
-    images = [depth, labels, color]
-    if lens is not None:
-        images = [
-            None if i is None else undistort(i, lens, check_intrinsics(intrinsics, i.shape[:2]))
-            for i in images
-        ]
-    return Observation(images[0], images[1], intrinsics, pose, images[2], **more)
+def _straight(given: dict[str, Any], lens: Float[np.ndarray, " 8"] | None) -> Observation:
+    """Return the observation of what a lens of this distortion shows."""
+    for name in ("depth", "labels", "color"):
+        image = given[name]
+        if lens is not None and image is not None:
+            intrinsics = check_intrinsics(given["intrinsics"], image.shape[:2])
+            given[name] = undistort(image, lens, intrinsics)
+    return Observation(**given)
 
 
 def _read_distortion(content: dict[str, Any], path: Path) -> Float[np.ndarray, " 8"] | None:

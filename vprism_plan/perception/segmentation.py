@@ -6,7 +6,7 @@ that touch are hills with valleys between them.
 """
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -62,27 +62,6 @@ _PROMINENCE = 0.022
 _RELATIVE_PROMINENCE = 0.25
 
 
-@dataclass(frozen=True)
-class _Limits:
-    min_height: float
-    max_height: float
-    max_size: float
-    min_area: float
-    min_points: int
-
-    def __post_init__(self) -> None:
-        for name in ("min_height", "max_height", "max_size", "min_area"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"{name} is {value}; it must be positive (metres)")
-        if self.min_height >= self.max_height:
-            raise ConfigError(
-                f"min_height {self.min_height} must be less than max_height {self.max_height}"
-            )
-        if self.min_points < 1:
-            raise ConfigError(f"min_points is {self.min_points}; it must be at least 1")
-
-
 def segment_tabletop(
     obs: Observation,
     *,
@@ -134,7 +113,14 @@ def segment_tabletop(
         PlaneNotFoundError: no support plane in view (see `fit_plane`).
         ConfigError: a limit that is not positive, or contradicts another.
     """
-    limits = _Limits(min_height, max_height, max_size, min_area, min_points)
+    limits = {"max_height": max_height, "max_size": max_size, "min_area": min_area}
+    for name, value in {"min_height": min_height, **limits}.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"{name} is {value}; it must be positive (metres)")
+    if min_height >= max_height:
+        raise ConfigError(f"min_height {min_height} must be less than max_height {max_height}")
+    if min_points < 1:
+        raise ConfigError(f"min_points is {min_points}; it must be at least 1")
     unlabelled = replace(obs, labels=None)
     plane = plane or obs.plane or fit_plane(unlabelled, seed=seed)
     points, depth = unlabelled.point_image(), obs.depth.copy()
@@ -159,7 +145,7 @@ def segment_tabletop(
     image = surface_image(depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))
     raised = (depth > 0) & (height > np.maximum(min_height, 3.0 * stereo_noise(depth)))
     clusters = _cluster_pixels(image, points, plane, raised, min_area)
-    labels = _accept(clusters, image, points, region, limits)
+    labels = _accept(clusters, image, points, region, min_points, **limits)
     logger.info("%d objects on the support plane", int(labels.max()))
     return replace(obs, depth=depth, labels=labels, plane=plane)
 
@@ -169,20 +155,23 @@ def _accept(
     image: SurfaceImage,
     points: PointImage,
     region: TableRegion,
-    limits: _Limits,
+    min_points: int,
+    max_height: float,
+    max_size: float,
+    min_area: float,
 ) -> Clusters:
     """Keep the clusters that can be objects on the table; number them by visible area."""
     accepted: list[tuple[float, int]] = []
     pixels, areas = np.bincount(clusters.ravel()), _areas(clusters, image)
-    large = (pixels >= limits.min_points) & (areas >= limits.min_area)
+    large = (pixels >= min_points) & (areas >= min_area)
     large[0] = False
     for cluster in np.flatnonzero(large).tolist():
         member = clusters == cluster
-        if np.percentile(image.height[member], 99.0) > limits.max_height:
+        if np.percentile(image.height[member], 99.0) > max_height:
             continue
         flat = points[member] @ region.axes.T
         size = np.percentile(flat, 99.0, axis=0) - np.percentile(flat, 1.0, axis=0)
-        if size.max() > limits.max_size:
+        if size.max() > max_size:
             continue
         if region.contains(points[member], 0.02).mean() >= _MIN_ON_TABLE:
             accepted.append((-float(areas[cluster]), cluster))

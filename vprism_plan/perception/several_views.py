@@ -164,8 +164,8 @@ def _moved(new: Samples, known: Samples, names: tuple[str, str]) -> list[str]:
     free = _in_free_space(new, known, _IN_FRONT)
     for i in np.union1d(new.ids[new.ids > 0], known.ids[known.ids > 0]).tolist():
         best = (0.0, 0.0, names)
-        for (ids, far), order in zip(free, (names, names[::-1]), strict=True):
-            own = far[ids == i]
+        for (ids, ahead), order in zip(free, (names, names[::-1]), strict=True):
+            own = ahead[ids == i]
             if len(own) >= _VOTES and (own > 0).any():
                 best = max(best, (float((own > 0).mean()), float(np.median(own[own > 0])), order))
         share, far, (here, there) = best
@@ -178,10 +178,10 @@ def _moved(new: Samples, known: Samples, names: tuple[str, str]) -> list[str]:
         one, other = new.of(new.ids == i), known.of(known.ids == i)
         if min(len(one.points), len(other.points)) < _VOTES:
             continue
-        own = lay(one, other, _OBJECT_STEPS, turn=_OBJECT_TURN)  # beside the whole view's
-        if own.offset > NAMED_OFFSET and own.certain(_VOTES, 1.25 * _SIGMAS):
+        motion = lay(one, other, _OBJECT_STEPS, turn=_OBJECT_TURN)  # beside the whole view's
+        if motion.offset > NAMED_OFFSET and motion.certain(_VOTES, 1.25 * _SIGMAS):
             found.append(
-                f"object {i} lies {1e3 * own.offset:.0f} mm off in {names[0]} from where "
+                f"object {i} lies {1e3 * motion.offset:.0f} mm off in {names[0]} from where "
                 f"{names[1]} shows it: {remedy}"
             )
     return found
@@ -196,7 +196,8 @@ def _other_ids(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[dict[
         known: those before.
     """
     ids = np.unique(laid[0].ids[laid[0].ids > 0]).tolist()
-    old = np.unique(np.concatenate([k.ids[k.ids > 0] for k in known])).tolist()
+    points, owner = (np.concatenate([getattr(k, n) for k in known]) for n in ("points", "ids"))
+    old = np.unique(owner[owner > 0]).tolist()
     mine, theirs = _shared(laid, known)
     table: dict[int, int] = {}
     for i in ids:
@@ -224,14 +225,7 @@ def _other_ids(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[dict[
     for i in [i for i in ids if i not in table and i in taken]:
         # Its own was given to another: it gets the old one beside it, or a free one.
         tree = cKDTree(laid[0].points[laid[0].ids == i])
-        gaps = {
-            j: min(
-                float(tree.query(k.points[k.ids == j])[0].min())
-                for k in known
-                if (k.ids == j).any()
-            )
-            for j in vacant
-        }
+        gaps = {j: float(np.min(tree.query(points[owner == j])[0])) for j in vacant}
         near = min(gaps, key=gaps.__getitem__, default=0)
         if near and gaps[near] < _BESIDE:
             vacant.remove(near)
