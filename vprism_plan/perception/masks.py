@@ -98,6 +98,7 @@ def mend(views: Sequence[Observation], plane: Plane, first: int = 0) -> tuple[Ob
     return _each(views, first, lambda view: _mended(view, plane))
 
 
+Window = tuple[slice, slice]
 Change = Callable[[Observation], tuple[Observation, list[str]]]
 
 
@@ -255,18 +256,19 @@ class _MaskView:
     pitch: float
 
     @classmethod
-    def of(cls, view: Observation, plane: Plane) -> "_MaskView":
-        """Return the whole view so."""
-        depth, K = view.depth.astype(np.float64), view.intrinsics
-        rays = pixel_rays(view.shape, K)
+    def of(cls, view: Observation, plane: Plane, window: Window) -> "_MaskView":
+        """Return a window of a view so."""
+        depth, K = view.depth[window].astype(np.float64), view.intrinsics.copy()
+        K[:2, 2] -= [window[1].start, window[0].start]
+        rays = pixel_rays(depth.shape, K)
         slant = rays @ (view.pose[:3, :3].T @ plane.normal)
         height = plane.signed_distance(view.camera_center) + depth * slant
         noise = np.maximum(_THIN, _SIGMAS * depth_sigma(depth) * np.abs(slant))
-        on_plane = (depth > 0) & (height < noise) & ~view.sees_robot
+        on_plane = (depth > 0) & (height < noise) & ~view.sees_robot[window]
         pitch = 1.0 / float(min(K[0, 0], K[1, 1]))
-        return cls(view.labels.copy(), depth, rays, slant, height, on_plane, pitch)
+        return cls(view.labels[window].copy(), depth, rays, slant, height, on_plane, pitch)
 
-    def part(self, window: tuple[slice, slice]) -> "_MaskView":
+    def part(self, window: Window) -> "_MaskView":
         """Return a window of the images."""
         names = ("labels", "depth", "rays", "slant", "height", "on_plane")
         return replace(self, **{name: getattr(self, name)[window] for name in names})
@@ -280,20 +282,24 @@ class _MaskView:
 def _mended(view: Observation, plane: Plane) -> tuple[Observation, list[str]]:
     if not view.labels.any():
         return view, []
-    image, found = _MaskView.of(view, plane), []
-    for value in _support_labels(image):
+    labels, depth, found = view.labels.copy(), view.depth.copy(), []
+    whole = _around(ndimage.find_objects((labels > 0).astype(np.int8))[0])
+    image, returns = _MaskView.of(view, plane, whole), depth[whole]
+    support = _support_labels(image)
+    if support:  # of what is near the objects; now of all
+        support = _support_labels(_MaskView.of(view, plane, (slice(0, None), slice(0, None))))
+    for value in support:
         image.labels[image.labels == value] = 0
         found.append(
             f"label {value} is no object: it covers most of the visible support surface; it "
             "is taken as background, set it to 0"
         )
     fringe, surface = _fringes(image)
-    ids, labels, depth = _ids(image.labels), image.labels.copy(), view.depth.copy()
+    ids, trimmed = _ids(image.labels), image.labels.copy()
     number = np.where(image.labels > 0, np.searchsorted(ids, image.labels) + 1, 0)
     too_wide: dict[int, int] = {}
     for value, box in zip(ids, ndimage.find_objects(number), strict=True):
-        rows, columns = (slice(max(0, s.start - _RING), s.stop + _RING) for s in box)
-        window = (rows, columns)
+        window = _around(box)
         part = image.part(window)
         own = part.labels == value
         pixels = int(own.sum())
@@ -302,7 +308,7 @@ def _mended(view: Observation, plane: Plane) -> tuple[Observation, list[str]]:
         if through.any():
             through |= border
             edge &= ~through
-            depth[window][through] = 0.0
+            returns[window][through] = 0.0
             found.append(
                 f"object {value}: {100 * through.sum() / pixels:.0f} % of its pixels show the "
                 "support surface behind it: it is see-through or flat, or its mask too wide; the "
@@ -311,7 +317,7 @@ def _mended(view: Observation, plane: Plane) -> tuple[Observation, list[str]]:
         elif edge.any():
             edge |= border
         if edge.any():
-            labels[window][edge] = surface[window][edge]
+            trimmed[window][edge] = surface[window][edge]
             too_wide[value] = int(edge.sum())
         lost = int((own & (part.depth == 0)).sum())
         if _LOST * pixels < lost < pixels:
@@ -326,7 +332,14 @@ def _mended(view: Observation, plane: Plane) -> tuple[Observation, list[str]]:
             f"{sum(too_wide.values())} pixels along their outlines show what lies beside them, "
             "and lose the label; check that labels and depth are registered"
         )
+    labels[whole] = trimmed
     return (replace(view, labels=labels, depth=depth), found) if found else (view, found)
+
+
+def _around(box: tuple[slice, ...]) -> Window:
+    """Rows and columns of some pixels, and a ring around them."""
+    rows, columns = (slice(max(0, s.start - _RING), s.stop + _RING) for s in box)
+    return rows, columns
 
 
 def _support_labels(image: _MaskView) -> list[int]:
@@ -423,6 +436,8 @@ def _fringes(view: _MaskView) -> tuple[Pixels, Ids]:
         if wide is None:
             wide = _too_wide(labels, on_plane, lines, fringed)
         fringed &= np.isin(labels[lines.pixels[:, 0]], wide)
+        if not fringed.any():
+            break
         run = lines.run & fringed[:, None]
         pixels, before = lines.pixels[run], np.repeat(lines.before, run.sum(axis=1))
         mask[pixels] = True
