@@ -100,7 +100,7 @@ def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape
 def stereo_noise(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Return the standard deviation of stereo depth (m): 2 mm at 1 m, growing as depth^2.
 
-    Nobody's camera is better: what tells neighbouring pixels of a segmentation apart.
+    The segmentation's own model: its slants and heights are tuned to it, not to `depth_sigma`.
     """
     return np.asarray(0.002 * np.maximum(0.5, np.asarray(depth, dtype=np.float64)) ** 2)
 
