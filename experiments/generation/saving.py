@@ -27,9 +27,9 @@ from experiments.generation.silhouettes import silhouettes
 from vprism_plan._files import read_json, reading, write_text
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import load_observation
-from vprism_plan.perception._files import write_atomically
-from vprism_plan.perception._validation import check_pose
 from vprism_plan.perception.camera import invert_transform
+from vprism_plan.perception.observation import check_pose
+from vprism_plan.perception.readers import write_atomically
 from vprism_plan.simulation.camera import Camera, DepthNoise
 from vprism_plan.simulation.scene_io import GROUND_TRUTH
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Pinhole camera geometry: pixels and depth to points, points to pixels.
+"""Pinhole camera geometry: pixels and depth to points, points to pixels; noise, distortion.
 
 Conventions: the camera frame is the optical one (x right, y down, z forward);
 depth is measured along z, in metres; pixel (u, v) = (column, row), and a whole
@@ -7,12 +7,23 @@ number is the *centre* of a pixel (OpenCV).
 """
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Bool, Float, Int, Int32, Num
+
+# What this package hands around.
+Vector = Float[np.ndarray, " 3"]
+Matrix = Float[np.ndarray, "3 3"]
+Pose = Float[np.ndarray, "4 4"]
+Image = Float[np.ndarray, "h w"]
+Pixels = Bool[np.ndarray, "h w"]
+Ids = Int32[np.ndarray, "h w"]
+PointImage = Float[np.ndarray, "h w 3"]
+Points = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, " n"]
+Chosen = Bool[np.ndarray, " n"]
+Indices = Int[np.ndarray, " n"]
 
 
-def pixel_rays(
-    shape: tuple[int, int], intrinsics: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "h w 3"]:
+def pixel_rays(shape: tuple[int, int], intrinsics: Matrix) -> PointImage:
     """Return, for every pixel, the point of its ray at depth z = 1 (camera frame, metres).
 
     Multiply by depth to get points; the rays are *not* of unit length.
@@ -24,17 +35,31 @@ def pixel_rays(
     return rays
 
 
-def backproject(
-    depth: Float[np.ndarray, "h w"], intrinsics: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "h w 3"]:
+def backproject(depth: Image, intrinsics: Matrix) -> PointImage:
     """Turn a depth image into camera-frame points (metres), NaN where depth is 0 (no return)."""
     rays = pixel_rays((depth.shape[0], depth.shape[1]), intrinsics)
     return rays * np.where(depth > 0, depth, np.nan)[..., None].astype(np.float64)
 
 
-def project(
-    points: Float[np.ndarray, "n 3"], intrinsics: Float[np.ndarray, "3 3"]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
+def point_image(depth: Image, intrinsics: Matrix, T_world_camera: Pose) -> PointImage:
+    """Return the world point (metres) behind every pixel, NaN where there is no return."""
+    return transform_points(T_world_camera, backproject(depth, intrinsics))
+
+
+def lift(
+    depth: Image,
+    intrinsics: Matrix,
+    row: Int[np.ndarray, "*some"],
+    column: Int[np.ndarray, "*some"],
+) -> Float[np.ndarray, "*some 3"]:
+    """Return the camera-frame points (metres) of some pixels, 0 where there is no return."""
+    z = depth[row, column].astype(np.float64)
+    x = (column - intrinsics[0, 2]) / intrinsics[0, 0] * z
+    y = (row - intrinsics[1, 2]) / intrinsics[1, 1] * z
+    return np.stack([x, y, z], axis=-1)
+
+
+def project(points: Points, intrinsics: Matrix) -> tuple[Float[np.ndarray, "n 2"], Values]:
     """Project camera-frame points (metres).
 
     Returns:
@@ -48,6 +73,22 @@ def project(
     return np.stack([u, v], axis=1), z
 
 
+def transform_points(
+    transform: Pose, points: Num[np.ndarray, "*batch 3"]
+) -> Float[np.ndarray, "*batch 3"]:
+    """Apply a rigid transform to points: `T_a_b` maps coordinates in b to coordinates in a."""
+    return np.asarray(points, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
+
+
+def invert_transform(transform: Pose) -> Pose:
+    """Return the inverse of a rigid transform, exactly rigid again."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = transform[:3, :3].T
+    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return inverse
+
+
+# -------------------------------------------------------------------------------------- noise
 def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
 
@@ -56,11 +97,27 @@ def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape
     return 0.0012 + 0.0019 * (np.asarray(depth, dtype=np.float64) - 0.4) ** 2
 
 
-def height_sigma(
-    rays: Float[np.ndarray, "n 3"],
-    depth: Float[np.ndarray, " n"],
-    normal: Float[np.ndarray, " 3"],
-) -> Float[np.ndarray, " n"]:
+def stereo_noise(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """Return the standard deviation of stereo depth (m): 2 mm at 1 m, growing as depth^2.
+
+    The segmentation's own model: its slants and heights are tuned to it, not to `depth_sigma`.
+    """
+    return np.asarray(0.002 * np.maximum(0.5, np.asarray(depth, dtype=np.float64)) ** 2)
+
+
+def inlier_band(
+    depth: Float[np.ndarray, "*shape"], threshold: float
+) -> Float[np.ndarray, "*shape"]:
+    """Half-width (metres) of the band in which a point at this depth counts as on a plane.
+
+    Stereo noise grows with the square of depth: `threshold` up to 1 m, beyond it
+    `threshold * depth^2`, and from 2 m on `4 * threshold`, or else a band at 5 m would
+    take in the table and the floor under it.
+    """
+    return np.asarray(threshold * np.clip(np.asarray(depth, dtype=np.float64), 1.0, 2.0) ** 2)
+
+
+def height_sigma(rays: Points, depth: Values, normal: Vector) -> Values:
     """Standard deviation of the depth noise as it shows along a surface's normal, metres.
 
     Args:
@@ -71,25 +128,39 @@ def height_sigma(
     return np.asarray(depth_sigma(depth) * (np.abs(rays @ normal) / depth))
 
 
-def transform_points(
-    transform: Float[np.ndarray, "4 4"], points: Num[np.ndarray, "*batch 3"]
-) -> Float[np.ndarray, "*batch 3"]:
-    """Apply a rigid transform to points: `T_a_b` maps coordinates in b to coordinates in a."""
-    return np.asarray(points, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
+# --------------------------------------------------------------------------------- distortion
+def undistort(
+    image: np.ndarray, coefficients: Float[np.ndarray, " 8"], intrinsics: Matrix
+) -> np.ndarray:
+    """Return an image (H, W, ...) as a pinhole camera of the same intrinsics sees it.
 
+    By nearest pixel: to blend the depths or the ids of two sides of an edge would invent
+    surfaces. Pixels that the lens did not see are 0: no return, background.
 
-def invert_transform(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return the inverse of a rigid transform, exactly rigid again."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = transform[:3, :3].T
-    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
-    return inverse
+    Args:
+        image: as the lens shows it.
+        coefficients: k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order).
+        intrinsics: valid for the image.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    (fx, _, cx), (_, fy, cy), _ = intrinsics
+    rays = pixel_rays((image.shape[0], image.shape[1]), intrinsics)
+    x, y = rays[..., 0], rays[..., 1]
+    square = x**2 + y**2
 
+    def stretch(s: np.ndarray) -> np.ndarray:
+        above = 1.0 + s * (k1 + s * (k2 + s * k3))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(above / (1.0 + s * (k4 + s * (k5 + s * k6))))
 
-def point_image(
-    depth: Float[np.ndarray, "h w"],
-    intrinsics: Float[np.ndarray, "3 3"],
-    T_world_camera: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "h w 3"]:
-    """Return the world point (metres) behind every pixel, NaN where there is no return."""
-    return transform_points(T_world_camera, backproject(depth, intrinsics))
+    # Far out the polynomial may turn back and show a pixel twice; from there on it is void.
+    radii = np.linspace(0.0, float(np.sqrt(square.max())), 1000)
+    grows = np.diff(radii * stretch(radii**2)) > 0.0
+    reach = np.inf if grows.all() else float(radii[np.argmin(grows)])
+    factor = np.where(np.sqrt(square) < reach, stretch(square), 1e9)
+    column = np.rint((x * factor + 2 * p1 * x * y + p2 * (square + 2 * x**2)) * fx + cx)
+    row = np.rint((y * factor + 2 * p2 * x * y + p1 * (square + 2 * y**2)) * fy + cy)
+    seen = (row >= 0) & (row < image.shape[0]) & (column >= 0) & (column < image.shape[1])
+    straight = image[tuple(np.where(seen, i, 0.0).astype(np.int64) for i in (row, column))]
+    straight[~seen] = 0
+    return straight

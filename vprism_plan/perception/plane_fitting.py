@@ -1,22 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Find the surface that the objects stand on."""
+"""Find the surface that the objects stand on, and put the world frame on it.
+
+RANSAC for planes (Fischler and Bolles, 1981) with least-squares refinement, in the camera
+frame. Each point has its own inlier band, since stereo noise grows with the square of depth.
+"""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.errors import ConfigError, PlaneNotFoundError
-from vprism_plan.perception._ransac import (
-    PlaneCandidate,
-    concentration,
-    find_plane,
-    refine,
+from vprism_plan.errors import ConfigError, ObservationError, PlaneNotFoundError
+from vprism_plan.perception.camera import (
+    Chosen,
+    Points,
+    Values,
+    Vector,
+    backproject,
+    inlier_band,
+    invert_transform,
 )
-from vprism_plan.perception.camera import backproject
 from vprism_plan.perception.observation import Observation
-from vprism_plan.perception.plane import Plane
+from vprism_plan.perception.plane import Plane, facing, over_extent, refine
 
 logger = logging.getLogger(__name__)
 
@@ -28,27 +34,37 @@ _MAX_BELOW = 0.3
 _OBJECT_HEIGHT = 0.4
 # A flat patch larger than this is furniture or a wall, not the side of an object.
 _OBJECT_SIZE = 0.6
-_CELL = 0.04
-# A surface that things stand on is level within this many degrees of a pose's z.
-LEVEL = 15.0
+# Cosine of 15 degrees: a surface that things stand on is level within them of a pose's z.
+_LEVEL = float(np.cos(np.radians(15.0)))
 # How many more points a wall needs to be taken for the support of a scene with a pose.
 _LEVEL_BONUS = 20.0
 # Part of the band in which a surface is looked for that the whole band mixes with another.
 _NARROW = 0.4
-# Concentration from which on a plane is a surface, see `concentration`.
+# Concentration from which on a plane is a surface, see `_concentration`.
 _CLEAR = 0.8
 # A level surface may hold this part of the share that others need: a board before a wall.
 _LEVEL_SHARE = 0.2
+# Triples of points that are tried, points that score them, the best of them that are refined.
+_HYPOTHESES, _SCORING_POINTS, _NEIGHBOURS, _REFINED = 768, 2000, 100, 8
 
 
-def inlier_band(depth: np.ndarray, threshold: float) -> np.ndarray:
-    """Half-width (metres) of the band in which a point at this depth counts as on the plane.
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A plane with what speaks for it among the points it was fitted to.
 
-    Stereo noise grows with the square of depth: `threshold` up to 1 m, beyond it
-    `threshold * depth^2`, and from 2 m on `4 * threshold`, or else a band at 5 m would
-    take in the table and the floor under it.
+    Attributes:
+        plane: camera frame, normal towards the camera.
+        inliers: (N,) which points lie in their band around the plane.
+        below: share of points in the two bands just under the plane, relative to the
+            inliers. Nothing is seen through a surface, so it is near 0 for a real plane
+            and about 1 for a slice through a curved surface or through noise.
+        rms: root mean square distance of the inliers, metres.
     """
-    return np.asarray(threshold * np.clip(np.asarray(depth, dtype=np.float64), 1.0, 2.0) ** 2)
+
+    plane: Plane
+    inliers: Chosen
+    below: float
+    rms: float
 
 
 def fit_plane(
@@ -77,97 +93,104 @@ def fit_plane(
             beneath it.
         ConfigError: `threshold` or `min_share` out of range.
     """
-    _check_arguments(threshold, min_share)
+    if not 0.0 < threshold <= 0.2:
+        raise ConfigError(f"threshold is {threshold}; it must lie in (0, 0.2] metres")
+    if not 0.0 < min_share <= 1.0:
+        raise ConfigError(f"min_share is {min_share}; it must lie in (0, 1]")
     valid = (obs.depth > 0) & ~obs.sees_robot
     points = backproject(obs.depth, obs.intrinsics)[valid]
-    is_object = np.zeros(len(points), dtype=bool)
-    if obs.labels is not None:
-        is_object = obs.labels[valid] > 0
-    if (~is_object).sum() < 3:
+    labels = np.zeros(len(points), dtype=np.int32) if obs.labels is None else obs.labels[valid]
+    background, standing, ids = points[labels <= 0], points[labels > 0], labels[labels > 0]
+    if len(background) < 3:
         raise PlaneNotFoundError(
-            f"{int((~is_object).sum())} background pixels have a depth return; at least 3 are "
+            f"{len(background)} background pixels have a depth return; at least 3 are "
             "needed to fit the support plane: is every pixel labelled as an object?"
         )
     rng = np.random.default_rng(seed)
-    background, standing = points[~is_object], points[is_object]
-    sample = background[_choose(len(background), _MAX_POINTS, rng)]
-    chosen = _choose(len(standing), _MAX_POINTS, rng)
-    standing = standing[chosen]
-    ids = None if obs.labels is None else obs.labels[valid][is_object][chosen]
+    sample = background[_choose(len(background), rng)]
+    chosen = _choose(len(standing), rng)
     band = inlier_band(sample[:, 2], threshold)
     everywhere = np.ones(len(sample), dtype=bool)
     candidates, rejected = _peel(sample, band, everywhere, min_share, rng)
     candidates += _overlooked(candidates, sample, band, min_share, rng, obs)
     if not candidates:
         raise PlaneNotFoundError(_why_not(rejected, min_share))
-    best = _choose_support(candidates, sample, standing, ids, obs, threshold)
+    if len(ids):
+        least = 0.02
+        carried = _touched(candidates, sample, standing[chosen], ids[chosen], threshold)
+    else:
+        least, carried = 0.1, _furnished(candidates, sample, threshold)
+    # Points on the plane, times how much stands on it, times its orientation. Without a pose
+    # 'up' is only a hint, since a camera may be mounted upside down.
+    scores = []
+    for candidate, share in zip(candidates, carried, strict=True):
+        cosine = float(np.clip(candidate.plane.normal @ _up(obs), -1.0, 1.0))
+        upright = 1.0 + 0.5 * cosine
+        if obs.posed and _is_level(candidate.plane, obs):
+            upright *= _LEVEL_BONUS
+        scores.append(float(candidate.inliers.sum()) * (least + min(1.0, float(share))) * upright)
+    best = candidates[int(np.argmax(scores))]
+    logger.debug("scores %s of %s", np.round(scores), [c.plane for c in candidates])
     band = inlier_band(background[:, 2], threshold)
     plane = refine(best.plane, background, band)
-    if concentration(plane, background, band) < _CLEAR:
+    if _concentration(plane, background, band) < _CLEAR:
         plane = refine(best.plane, background, _NARROW * band)
     share = float(best.inliers.mean())
     logger.info("support plane holds %.0f %% of the background, rms %.4f m", 100 * share, best.rms)
     return plane.transformed(obs.pose)
 
 
-def _check_arguments(threshold: float, min_share: float) -> None:
-    if not 0.0 < threshold <= 0.2:
-        raise ConfigError(f"threshold is {threshold}; it must lie in (0, 0.2] metres")
-    if not 0.0 < min_share <= 1.0:
-        raise ConfigError(f"min_share is {min_share}; it must lie in (0, 1]")
-
-
-def _choose(count: int, at_most: int, rng: np.random.Generator) -> np.ndarray:
-    if count <= at_most:
+def _choose(count: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
+    if count <= _MAX_POINTS:
         return np.arange(count)
-    return np.sort(rng.choice(count, size=at_most, replace=False))
+    return np.sort(rng.choice(count, size=_MAX_POINTS, replace=False))
 
 
-def _up(obs: Observation) -> Float[np.ndarray, " 3"]:
+def _up(obs: Observation) -> Vector:
     """Return a guess of 'up' in the camera frame: world z if posed, else the image's up."""
     return obs.pose[2, :3] if obs.posed else np.array([0.0, -1.0, 0.0])
 
 
 def _is_level(plane: Plane, obs: Observation) -> bool:
     """Whether a plane in the camera frame is level, seen from above, by the pose."""
-    return bool(plane.normal @ _up(obs) > np.cos(np.radians(LEVEL)))
+    return bool(plane.normal @ _up(obs) > _LEVEL)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rejection:
-    share: float
-    below: float
-
-
+# ------------------------------------------------------------------------- planes among points
 def _peel(
-    points: Float[np.ndarray, "n 3"],
-    band: Float[np.ndarray, " n"],
-    among: Bool[np.ndarray, " n"],
+    points: Points,
+    band: Values,
+    among: Chosen,
     min_share: float,
     rng: np.random.Generator,
-    up: Float[np.ndarray, " 3"] | None = None,
-) -> tuple[list[PlaneCandidate], list[_Rejection]]:
+    up: Vector | None = None,
+) -> tuple[list[_Candidate], list[tuple[float, float]]]:
     """Peel the largest planes off some of the points, one by one; with `up`, level ones only.
 
-    Returns planes, whose `inliers` index into `points`, and what was none.
+    Returns planes, whose `inliers` index into `points`, and share and `below` of what was none.
     """
     remaining = np.flatnonzero(among)
-    found: list[PlaneCandidate] = []
-    rejected: list[_Rejection] = []
+    found: list[_Candidate] = []
+    rejected: list[tuple[float, float]] = []
     for _ in range(_MAX_PLANES):
         if len(remaining) < max(3, min_share * len(points)):
             break
-        candidate = find_plane(points[remaining], band[remaining], rng, up, LEVEL)
+        candidate = _find_plane(points[remaining], band[remaining], rng, up)
         if candidate is None:
             break
         share = float(candidate.inliers.sum()) / len(points)
         inliers = np.zeros(len(points), dtype=bool)
         inliers[remaining[candidate.inliers]] = True
-        below = max(candidate.below, _seen_through(candidate.plane, points, band, inliers))
+        # A ring around the walls of a bin, above the floor that was peeled off, is no surface:
+        # other planes' points under its own cells count as well.
+        height = candidate.plane.signed_distance(points) / band
+        under = points[(height <= -1.0) & (height > -3.0)]
+        through = over_extent(candidate.plane, points[inliers], under, grown=False)
+        below = max(candidate.below, float(through.sum()) / max(1, int(inliers.sum())))
         if share >= min_share and below <= _MAX_BELOW:
-            found.append(PlaneCandidate(candidate.plane, inliers, below, candidate.rms))
+            found.append(replace(candidate, inliers=inliers, below=below))
         else:
-            rejected.append(_Rejection(share, below))
+            rejected.append((share, below))
         if share < min_share:
             break
         # Twice the band: the fringe of a warped surface is not a plane of its own.
@@ -177,114 +200,129 @@ def _peel(
 
 
 def _overlooked(
-    candidates: list[PlaneCandidate],
-    points: Float[np.ndarray, "n 3"],
-    band: Float[np.ndarray, " n"],
+    candidates: list[_Candidate],
+    points: Points,
+    band: Values,
     min_share: float,
     rng: np.random.Generator,
     obs: Observation,
-) -> list[PlaneCandidate]:
+) -> list[_Candidate]:
     """Surfaces that the band mixed with others and, with a pose, small level ones.
 
     A narrow band tells the floor of a bin from the foot of its walls.
     """
-    clear = [concentration(c.plane, points, band) >= _CLEAR for c in candidates]
+    clear = [_concentration(c.plane, points, band) >= _CLEAR for c in candidates]
     if all(clear) and not obs.posed:
         return []
     narrow, rest = _NARROW * band, np.ones(len(points), dtype=bool)
     for candidate, is_clear in zip(candidates, clear, strict=True):
         if is_clear:
-            level = obs.posed and _is_level(candidate.plane, obs)
-            rest &= np.abs(candidate.plane.signed_distance(points)) > 2.0 * (
-                band if level else narrow
-            )
-    up, share = None, min_share
-    if obs.posed:
-        up, share = _up(obs), _LEVEL_SHARE * min_share
-    found = []
-    for other in _peel(points, narrow, rest, share, rng, up)[0]:
-        if concentration(other.plane, points[rest], narrow[rest]) >= _CLEAR:
-            whole = np.abs(other.plane.signed_distance(points)) < band
-            found.append(PlaneCandidate(other.plane, whole, other.below, other.rms))
-    return found
+            width = band if obs.posed and _is_level(candidate.plane, obs) else narrow
+            rest &= np.abs(candidate.plane.signed_distance(points)) > 2.0 * width
+    up, share = (_up(obs), _LEVEL_SHARE * min_share) if obs.posed else (None, min_share)
+    return [
+        replace(other, inliers=np.abs(other.plane.signed_distance(points)) < band)
+        for other in _peel(points, narrow, rest, share, rng, up)[0]
+        if _concentration(other.plane, points[rest], narrow[rest]) >= _CLEAR
+    ]
 
 
-def _seen_through(
-    plane: Plane,
-    points: Float[np.ndarray, "n 3"],
-    band: Float[np.ndarray, " n"],
-    inliers: Bool[np.ndarray, " n"],
-) -> float:
-    """Share of points just under the inliers' own 4 cm cells, those of other planes included.
+def _concentration(plane: Plane, points: Points, band: Values) -> float:
+    """Share of the points in the band that lie in its middle half.
 
-    A ring around the walls of a bin, above the floor that was peeled off, is no surface.
+    0.8 to 1 for the surface of a real table, a half where a plane cuts through others: the
+    floor of a bin and the foot of its wall together, in a band wider than the noise.
     """
-    height = plane.signed_distance(points) / band
-    under = points[(height <= -1.0) & (height > -3.0)]
-    seen = over_extent(plane, points[inliers], under, grown=False)
-    return float(seen.sum()) / max(1, int(inliers.sum()))
+    height = np.abs(plane.signed_distance(points)) / band
+    return float((height < 0.5).sum()) / max(1, int((height < 1.0).sum()))
 
 
-def _why_not(rejected: list[_Rejection], min_share: float) -> str:
+def _find_plane(
+    points: Points, band: Values, rng: np.random.Generator, up: Vector | None
+) -> _Candidate | None:
+    """Return the plane with most points in its band, or None if no triple spans one.
+
+    Two thirds of the hypotheses take their three points from one neighbourhood: on a
+    cluttered scene three random points rarely share a surface, three neighbours mostly
+    do. The best few are refined on all points before the best is chosen. With `up`, only
+    planes count that are level.
+    """
+    least = -2.0 if up is None else _LEVEL
+    up = np.zeros(3) if up is None else up
+    subset = rng.choice(len(points), size=min(len(points), _SCORING_POINTS), replace=False)
+    scored, scored_band = points[subset], band[subset]
+    normals, offsets = _hypotheses(scored, rng)
+    towards_camera = np.where(offsets > 0, -1.0, 1.0)
+    level = towards_camera * (normals @ up) >= least
+    normals, offsets = normals[level], offsets[level]
+    counts = np.empty(len(normals), dtype=np.int64)
+    for start in range(0, len(normals), 128):
+        part = slice(start, start + 128)
+        distance = np.abs(scored @ normals[part].T - offsets[part])
+        counts[part] = (distance < scored_band[:, None]).sum(axis=0)
+    best: _Candidate | None = None
+    for index in np.argsort(-counts, kind="stable")[:_REFINED]:
+        plane = refine(facing(normals[index], float(offsets[index])), points, band)
+        if plane.normal @ up < least:
+            continue
+        distance = plane.signed_distance(points)
+        height = distance / band
+        inliers = np.abs(height) < 1.0
+        count = int(inliers.sum())
+        if best is None or count > best.inliers.sum():
+            below = float(((height <= -1.0) & (height > -3.0)).sum()) / max(count, 1)
+            rms = float(np.sqrt(np.mean(distance[inliers] ** 2))) if count else 0.0
+            best = _Candidate(plane, inliers, below, rms)
+    return best
+
+
+def _hypotheses(
+    points: Points, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
+    """Normals and offsets of planes through triples of points, degenerate triples dropped."""
+    from scipy.spatial import cKDTree
+
+    n_local = 2 * _HYPOTHESES // 3
+    neighbours = min(_NEIGHBOURS, len(points))
+    anchors = rng.integers(len(points), size=n_local)
+    near = np.asarray(cKDTree(points).query(points[anchors], k=neighbours)[1])
+    pick = rng.integers(neighbours, size=(n_local, 2))
+    local = np.column_stack([anchors, np.take_along_axis(near, pick, axis=1)])
+    triples = np.concatenate([local, rng.integers(len(points), size=(_HYPOTHESES - n_local, 3))])
+    a, b, c = points[triples.T]
+    normals = np.cross(b - a, c - a)
+    area = np.linalg.norm(normals, axis=1)
+    longest = np.maximum(np.linalg.norm(b - a, axis=1), np.linalg.norm(c - a, axis=1))
+    usable = (area > 1e-3 * longest**2) & (area > 0)
+    normals = normals[usable] / area[usable, None]
+    return normals, np.einsum("ij,ij->i", normals, a[usable])
+
+
+def _why_not(rejected: list[tuple[float, float]], min_share: float) -> str:
     remedy = "is the table in view, and is depth in metres?"
     if not rejected:
         return f"no three background points span a plane; {remedy}"
-    largest = max(rejected, key=lambda r: r.share)
-    if largest.share < min_share:
+    largest = max(share for share, _ in rejected)
+    if largest < min_share:
         return (
-            f"the largest plane holds {100 * largest.share:.1f} % of the background, at least "
+            f"the largest plane holds {100 * largest:.1f} % of the background, at least "
             f"{100 * min_share:g} % is needed (min_share); {remedy}"
         )
     return (
-        f"the largest flat region ({100 * largest.share:.0f} % of the background) is a slice "
+        f"the largest flat region ({100 * largest:.0f} % of the background) is a slice "
         f"through something curved or noisy, not a surface; {remedy}"
     )
 
 
-def _choose_support(
-    candidates: list[PlaneCandidate],
-    sample: Float[np.ndarray, "n 3"],
-    standing: Float[np.ndarray, "m 3"],
-    ids: Int[np.ndarray, " m"] | None,
-    obs: Observation,
-    threshold: float,
-) -> PlaneCandidate:
-    """Return the candidate that carries most: see `fit_plane`.
-
-    The score is the number of points on the plane, times how much stands on it, times its
-    orientation. Without a pose 'up' is only a hint, since a camera may be mounted upside
-    down; with one, a level surface is preferred to any wall that carries as much.
-    """
-    if ids is not None and len(ids):
-        least, carried = 0.02, _touched(candidates, sample, standing, ids, threshold)
-    else:
-        least, carried = 0.1, _furnished(candidates, sample, threshold)
-    up = _up(obs)
-    scores = []
-    for candidate, share in zip(candidates, carried, strict=True):
-        cosine = float(np.clip(candidate.plane.normal @ up, -1.0, 1.0))
-        upright = 1.0 + 0.5 * cosine
-        if obs.posed and _is_level(candidate.plane, obs):
-            upright *= _LEVEL_BONUS
-        scores.append(float(candidate.inliers.sum()) * (least + min(1.0, float(share))) * upright)
-        logger.debug(
-            "plane %s: %d inliers, carries %.3f, score %.0f",
-            np.round(candidate.plane.normal, 2),
-            candidate.inliers.sum(),
-            share,
-            scores[-1],
-        )
-    return candidates[int(np.argmax(scores))]
-
-
-def _furnished(
-    candidates: list[PlaneCandidate], sample: Float[np.ndarray, "n 3"], threshold: float
-) -> list[float]:
+# ----------------------------------------------------------------------- what stands on a plane
+def _furnished(candidates: list[_Candidate], sample: Points, threshold: float) -> list[float]:
     """How full each plane is with unlabelled things; 1 is a set table."""
     # A floor does not stand on the wall it meets, nor a table top on the floor.
     furniture = np.zeros(len(sample), dtype=bool)
     for candidate in candidates:
-        if _extent(sample[candidate.inliers], candidate.plane) > _OBJECT_SIZE:
+        flat = sample[candidate.inliers] @ candidate.plane.axes().T
+        low, high = np.percentile(flat, [5.0, 95.0], axis=0)
+        if np.linalg.norm(high - low) > _OBJECT_SIZE:
             furniture |= candidate.inliers
     result = []
     for candidate in candidates:
@@ -297,8 +335,8 @@ def _furnished(
 
 
 def _touched(
-    candidates: list[PlaneCandidate],
-    sample: Float[np.ndarray, "n 3"],
+    candidates: list[_Candidate],
+    sample: Points,
     standing: Float[np.ndarray, "m 3"],
     ids: Int[np.ndarray, " m"],
     threshold: float,
@@ -329,17 +367,8 @@ def _touched(
     return (share / 0.5).tolist()
 
 
-def _extent(points: Float[np.ndarray, "n 3"], plane: Plane) -> float:
-    """Diagonal of the middle 90 % of points on a plane, metres."""
-    low, high = np.percentile(points @ plane.axes().T, [5.0, 95.0], axis=0)
-    return float(np.linalg.norm(high - low))
-
-
 def standing_on(
-    plane: Plane,
-    on_plane: Float[np.ndarray, "n 3"],
-    others: Float[np.ndarray, "m 3"],
-    threshold: float,
+    plane: Plane, on_plane: Points, others: Float[np.ndarray, "m 3"], threshold: float
 ) -> Bool[np.ndarray, " m"]:
     """Which of `others` stand over the plane's visible extent, within 0.4 m of it."""
     height = plane.signed_distance(others)
@@ -349,33 +378,55 @@ def standing_on(
     return result
 
 
-def over_extent(
-    plane: Plane,
-    on_plane: Float[np.ndarray, "n 3"],
-    others: Float[np.ndarray, "m 3"],
-    grown: bool = True,
-) -> Bool[np.ndarray, " m"]:
-    """Which of `others` have their foot on the plane's visible extent.
+# ------------------------------------------------------------------------- the world on a plane
+def align_to_table(obs: Observation, *, plane: Plane | None = None, seed: int = 0) -> Observation:
+    """Return the observation in a world frame that stands on its support plane.
 
-    The extent is a grid of 4 cm cells that hold a point of the plane. `grown`, it is closed
-    over gaps of 12 cm and one cell wider: the foot and the shadow of an object are not visible.
+    World z is the plane's normal and the plane is z = 0. The origin is the foot of the
+    objects' mean point (of the plane's own points if the observation is unlabelled).
+    World x is the camera's viewing direction laid into the plane, so the camera looks
+    along +x; seen from straight above, where that direction vanishes, x is the image's
+    upward direction instead. y completes the right-handed frame (left of the view).
+
+    Args:
+        obs: posed or unposed; an existing pose is replaced.
+        plane: support plane in the world frame of `obs`; default: `obs.plane`, else fitted.
+        seed: seed of the plane fit.
+
+    Raises:
+        PlaneNotFoundError: no support plane (see `fit_plane`).
+        ObservationError: the camera lies in the plane or below it.
     """
-    from scipy import ndimage
+    plane = plane or obs.plane or fit_plane(obs, seed=seed)
+    plane = plane.transformed(invert_transform(obs.pose))
+    if plane.offset >= -1e-6:
+        raise ObservationError(
+            f"the camera is {-plane.offset:.3g} m above the support plane; it must be on "
+            "the side that the plane's normal points to: flip the plane's normal"
+        )
+    z = plane.normal
+    x = np.array([0.0, 0.0, 1.0]) - z[2] * z
+    if np.linalg.norm(x) < 0.05:
+        image_up = np.array([0.0, -1.0, 0.0])
+        x = image_up - (image_up @ z) * z
+    x = x / np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
+    pose[:3, 3] = -pose[:3, :3] @ _origin(obs, plane)
+    return replace(obs, T_world_camera=pose, plane=Plane(np.array([0.0, 0.0, 1.0]), 0.0))
 
-    if not len(on_plane):
-        return np.zeros(len(others), dtype=bool)
-    axes = plane.axes()
-    cells = np.floor(on_plane @ axes.T / _CELL).astype(np.int64)
-    lower = cells.min(axis=0) - 4
-    # Far strays of a distant floor could span a huge grid: cells are kept within 10 m.
-    upper = np.minimum(cells.max(axis=0) + 5, lower + int(10.0 / _CELL))
-    grid = np.zeros(upper - lower, dtype=bool)
-    inside = ((cells >= lower) & (cells < upper)).all(axis=1)
-    grid[tuple((cells[inside] - lower).T)] = True
-    if grown:
-        grid = ndimage.binary_closing(grid, iterations=3)
-        grid = ndimage.binary_dilation(grid)
-    feet = np.floor(others @ axes.T / _CELL).astype(np.int64) - lower
-    inside = ((feet >= 0) & (feet < grid.shape)).all(axis=1)
-    inside[inside] = grid[tuple(feet[inside].T)]
-    return inside
+
+def _origin(obs: Observation, plane: Plane) -> Vector:
+    """Origin of the table frame, camera coordinates."""
+    points, labels = replace(obs, T_world_camera=None, plane=None).points()
+    chosen = points[labels > 0]
+    if not len(chosen):
+        points = points[~obs.sees_robot[obs.depth > 0]]
+        band = inlier_band(points[:, 2], 0.01)
+        chosen = points[np.abs(plane.signed_distance(points)) < band]
+    if not len(chosen):
+        raise ObservationError(
+            "no observed point lies on the given support plane and no object is labelled, so "
+            "there is nothing to put the origin under; check the plane's frame and units"
+        )
+    return plane.project(chosen.mean(axis=0))

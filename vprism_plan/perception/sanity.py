@@ -9,12 +9,10 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception._ransac import least_squares_plane
-from vprism_plan.perception.camera import pixel_rays
+from vprism_plan.perception.camera import Points, Vector, inlier_band, pixel_rays
 from vprism_plan.perception.masks import mend
 from vprism_plan.perception.observation import Observation
-from vprism_plan.perception.plane import Plane
-from vprism_plan.perception.plane_fitting import inlier_band
+from vprism_plan.perception.plane import Plane, in_grid, least_squares_plane
 from vprism_plan.perception.several_views import agree
 
 _TILTED, _NO_TABLE = 15.0, 45.0  # degrees off the world's z: named, refused
@@ -86,7 +84,7 @@ def _pose(view: Observation, plane: Plane) -> list[str]:
     return [f"{where}; check T_world_camera{remedy}"]
 
 
-def _angle(normal: Float[np.ndarray, " 3"]) -> float:
+def _angle(normal: Vector) -> float:
     """Degrees between a direction and the world's z."""
     return float(np.degrees(np.arccos(np.clip(normal[2], -1.0, 1.0))))
 
@@ -150,7 +148,7 @@ def _bend(view: Observation, plane: Plane) -> list[str]:
     ]
 
 
-def _rms(points: Float[np.ndarray, "n 3"]) -> float:
+def _rms(points: Points) -> float:
     plane = least_squares_plane(points, np.ones(len(points)))
     return float(np.sqrt(np.mean(plane.signed_distance(points) ** 2)))
 
@@ -196,20 +194,15 @@ def _without_what_is_behind_the_surface(view: Observation, plane: Plane) -> Obse
 
 
 def _enclosed(
-    plane: Plane, seen: Float[np.ndarray, "n 3"], asked: Float[np.ndarray, "m 3"]
+    plane: Plane, seen: Points, asked: Float[np.ndarray, "m 3"]
 ) -> Bool[np.ndarray, " m"]:
     """Which points of a plane lie inside what was seen of it, or in a hole of that."""
-    axes = plane.axes()
-    flat, others = seen @ axes.T, asked @ axes.T
-    if len(flat) == 0:
+    if len(seen) == 0:
         return np.zeros(len(asked), dtype=bool)
+    flat, others = seen @ plane.axes().T, asked @ plane.axes().T
     low = flat.min(axis=0) - 2 * _CELL
-    shape = np.ceil((flat.max(axis=0) - low) / _CELL).astype(int) + 3
-    grid = np.zeros(shape, dtype=bool)
+    grid = np.zeros(np.ceil((flat.max(axis=0) - low) / _CELL).astype(int) + 3, dtype=bool)
     grid[tuple(np.floor((flat - low) / _CELL).astype(int).T)] = True
-    grid = ndimage.binary_closing(grid, iterations=1)
-    grid = ndimage.binary_erosion(ndimage.binary_fill_holes(grid), iterations=2)
-    index = np.floor((others - low) / _CELL).astype(int)
-    inside = ((index >= 0) & (index < shape)).all(axis=1)
-    inside[inside] = grid[tuple(index[inside].T)]
-    return inside
+    grid = ndimage.binary_fill_holes(ndimage.binary_closing(grid))
+    grid = ndimage.binary_erosion(grid, iterations=2)
+    return in_grid(grid, np.floor((others - low) / _CELL).astype(int))

@@ -1,27 +1,42 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Object labels from geometry alone, where the user has no segmentation model."""
+"""Object labels from geometry alone, where the user has no segmentation model.
+
+Euclidean clusters of the pixels above a plane, on the image's own neighbourhood graph. Objects
+that touch are hills with valleys between them.
+"""
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from vprism_plan.errors import ConfigError, PlaneNotFoundError
-from vprism_plan.perception._clusters import cluster_pixels
-from vprism_plan.perception._image_graph import (
+from vprism_plan.perception.camera import (
+    Indices,
+    Pixels,
+    PointImage,
+    Points,
+    Values,
+    inlier_band,
+    stereo_noise,
+)
+from vprism_plan.perception.image_graph import (
     SurfaceImage,
-    depth_noise,
+    components,
     flying_pixels,
+    graph_edges,
+    jump_pixels,
     specks,
     surface_image,
 )
-from vprism_plan.perception._table_region import TableRegion, table_region
 from vprism_plan.perception.observation import Observation
-from vprism_plan.perception.plane import Plane
-from vprism_plan.perception.plane_fitting import fit_plane, inlier_band
+from vprism_plan.perception.plane import Plane, TableRegion, table_region
+from vprism_plan.perception.plane_fitting import fit_plane
 
 logger = logging.getLogger(__name__)
+
+Clusters = Int[np.ndarray, "h w"]
 
 _SPECK_PIXELS = 12
 _SPECK_AREA = 1e-4
@@ -31,26 +46,20 @@ _WORKSPACE_HEIGHT = 1.0
 # A cluster belongs to the table if this share of it stands over the table top.
 _MIN_ON_TABLE = 0.6
 
+# Pixels cut off at a depth edge go back to the cluster they are this close to.
+_REACH = 0.015
+# A fragment is at most this share of what it is joined to.
+_FRAGMENT = 0.25
+_CONTACT = 0.1
+_MIN_FRAGMENT = 1e-4
+# Share of a cluster's footprint inside another's hull that makes it a part of the other.
+_INSIDE = 0.7
 
-@dataclass(frozen=True)
-class _Limits:
-    min_height: float
-    max_height: float
-    max_size: float
-    min_area: float
-    min_points: int
-
-    def __post_init__(self) -> None:
-        for name in ("min_height", "max_height", "max_size", "min_area"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigError(f"{name} is {value}; it must be positive (metres)")
-        if self.min_height >= self.max_height:
-            raise ConfigError(
-                f"min_height {self.min_height} must be less than max_height {self.max_height}"
-            )
-        if self.min_points < 1:
-            raise ConfigError(f"min_points is {self.min_points}; it must be at least 1")
+_STEP = 0.005  # metres by which the water rises
+# A summit must rise this much over the pass to its neighbour: in metres, and as a share of
+# its height above the table. Rims, knobs and handles do not.
+_PROMINENCE = 0.022
+_RELATIVE_PROMINENCE = 0.25
 
 
 def segment_tabletop(
@@ -104,84 +113,260 @@ def segment_tabletop(
         PlaneNotFoundError: no support plane in view (see `fit_plane`).
         ConfigError: a limit that is not positive, or contradicts another.
     """
-    limits = _Limits(min_height, max_height, max_size, min_area, min_points)
+    limits = {"max_height": max_height, "max_size": max_size, "min_area": min_area}
+    for name, value in {"min_height": min_height, **limits}.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"{name} is {value}; it must be positive (metres)")
+    if min_height >= max_height:
+        raise ConfigError(f"min_height {min_height} must be less than max_height {max_height}")
+    if min_points < 1:
+        raise ConfigError(f"min_points is {min_points}; it must be at least 1")
     unlabelled = replace(obs, labels=None)
     plane = plane or obs.plane or fit_plane(unlabelled, seed=seed)
-    points = unlabelled.point_image()
+    points, depth = unlabelled.point_image(), obs.depth.copy()
     height = np.nan_to_num(plane.signed_distance(points), nan=-np.inf)
     height[obs.sees_robot] = -np.inf  # neither a surface nor something that stands on it
-    region = _visible_table(plane, points, obs.depth, height)
-    depth = obs.depth.copy()
-    if remove_flying:
-        noise = _noise_pixels(obs, plane, points, height, region, min_height)
-        depth[noise] = 0.0
-        height[noise] = -np.inf
-        logger.info("%d flying pixels and specks set to 'no return'", int(noise.sum()))
-    image = surface_image(depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))
-    raised = (depth > 0) & (height > np.maximum(min_height, 3.0 * depth_noise(depth)))
-    clusters = cluster_pixels(image, points, plane, raised, min_area)
-    labels = _accept(clusters, image, points, region, limits)
-    logger.info("%d objects on the support plane", int(labels.max()))
-    return replace(obs, depth=depth, labels=labels, plane=plane)
-
-
-def _visible_table(
-    plane: Plane,
-    points: Float[np.ndarray, "h w 3"],
-    depth: Float[np.ndarray, "h w"],
-    height: Float[np.ndarray, "h w"],
-) -> TableRegion:
     on_plane = (depth > 0) & (np.abs(height) < inlier_band(depth, 0.01))
     if on_plane.sum() < 3:
         raise PlaneNotFoundError(
             f"{int(on_plane.sum())} observed points lie on the given plane; check its frame and "
             "units, or let it be fitted"
         )
-    return table_region(plane, points[on_plane])
-
-
-def _noise_pixels(
-    obs: Observation,
-    plane: Plane,
-    points: Float[np.ndarray, "h w 3"],
-    height: Float[np.ndarray, "h w"],
-    region: TableRegion,
-    min_height: float,
-) -> Bool[np.ndarray, "h w"]:
-    """Flying pixels and specks over the table."""
-    image = surface_image(obs.depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))
-    over_table = (height > min_height) & (height < _WORKSPACE_HEIGHT)
-    over_table[over_table] = region.contains(points[over_table], _WORKSPACE_MARGIN)
-    flying = flying_pixels(image) & over_table
-    small = specks(image, (obs.depth > 0) & ~flying, _SPECK_PIXELS, _SPECK_AREA)
-    return np.asarray(flying | (small & over_table))
+    region = table_region(plane, points[on_plane])
+    if remove_flying:
+        image = surface_image(depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))
+        over_table = (height > min_height) & (height < _WORKSPACE_HEIGHT)
+        over_table[over_table] = region.contains(points[over_table], _WORKSPACE_MARGIN)
+        noise = flying_pixels(image) & over_table
+        noise |= specks(image, (depth > 0) & ~noise, _SPECK_PIXELS, _SPECK_AREA) & over_table
+        depth[noise] = 0.0
+        height[noise] = -np.inf
+        logger.info("%d flying pixels and specks set to 'no return'", int(noise.sum()))
+    image = surface_image(depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))
+    raised = (depth > 0) & (height > np.maximum(min_height, 3.0 * stereo_noise(depth)))
+    clusters = _cluster_pixels(image, points, plane, raised, min_area)
+    labels = _accept(clusters, image, points, region, min_points, **limits)
+    logger.info("%d objects on the support plane", int(labels.max()))
+    return replace(obs, depth=depth, labels=labels, plane=plane)
 
 
 def _accept(
-    clusters: Int[np.ndarray, "h w"],
+    clusters: Clusters,
     image: SurfaceImage,
-    points: Float[np.ndarray, "h w 3"],
+    points: PointImage,
     region: TableRegion,
-    limits: _Limits,
-) -> Int[np.ndarray, "h w"]:
+    min_points: int,
+    max_height: float,
+    max_size: float,
+    min_area: float,
+) -> Clusters:
     """Keep the clusters that can be objects on the table; number them by visible area."""
     accepted: list[tuple[float, int]] = []
-    pixels = np.bincount(clusters.ravel())
-    areas = np.bincount(clusters.ravel(), weights=(image.pitch**2).ravel())
-    large = (pixels >= limits.min_points) & (areas >= limits.min_area)
+    pixels, areas = np.bincount(clusters.ravel()), _areas(clusters, image)
+    large = (pixels >= min_points) & (areas >= min_area)
     large[0] = False
     for cluster in np.flatnonzero(large).tolist():
         member = clusters == cluster
-        if np.percentile(image.height[member], 99.0) > limits.max_height:
+        if np.percentile(image.height[member], 99.0) > max_height:
             continue
         flat = points[member] @ region.axes.T
         size = np.percentile(flat, 99.0, axis=0) - np.percentile(flat, 1.0, axis=0)
-        if size.max() > limits.max_size:
+        if size.max() > max_size:
             continue
-        if region.contains(points[member], 0.02).mean() < _MIN_ON_TABLE:
-            continue
-        accepted.append((-float(areas[cluster]), cluster))
-    number = np.zeros(int(clusters.max()) + 1, dtype=np.int32)
+        if region.contains(points[member], 0.02).mean() >= _MIN_ON_TABLE:
+            accepted.append((-float(areas[cluster]), cluster))
+    number = np.zeros(len(pixels), dtype=np.int32)
     for label, (_, cluster) in enumerate(sorted(accepted), start=1):
         number[cluster] = label
     return number[clusters]
+
+
+# ----------------------------------------------------------------------------------- clusters
+def _cluster_pixels(
+    image: SurfaceImage, points: PointImage, plane: Plane, raised: Pixels, min_area: float
+) -> Clusters:
+    """Number the clusters of the raised pixels from 1, 0 = none; see `segment_tabletop`."""
+    from scipy import ndimage
+
+    core = raised & ~jump_pixels(image)
+    clusters = np.zeros(raised.shape, dtype=np.int64)
+    if not core.any():
+        core = raised
+    if not core.any():
+        return clusters
+    start, end = graph_edges(image, core)
+    height = np.asarray(ndimage.median_filter(image.height, size=3))
+    clusters[core] = _split_at_valleys(height[core], image.pitch[core] ** 2, start, end, min_area)
+    keep = _areas(clusters, image) >= 0.25 * min_area
+    keep[0] = False
+    clusters = np.where(keep, np.cumsum(keep), 0)[clusters]
+    _attach(clusters, raised, points)
+    # What is left is so thin that every pixel of it is at an edge.
+    loose = raised & (clusters == 0)
+    thin = components(int(loose.sum()), *graph_edges(image, loose))
+    clusters[loose] = thin + 1 + clusters.max()
+    clusters = _join_fragments(clusters, image, points, plane)
+    _fill_holes(clusters, image)
+    return clusters
+
+
+def _areas(clusters: Clusters, image: SurfaceImage) -> Float[np.ndarray, " c"]:
+    return np.bincount(clusters.ravel(), weights=(image.pitch**2).ravel())
+
+
+def _attach(clusters: Clusters, raised: Pixels, points: PointImage) -> None:
+    """Give raised pixels without a cluster to the nearest one in space, if it is near."""
+    from scipy.spatial import cKDTree
+
+    owned = clusters > 0
+    loose = raised & ~owned
+    if owned.any() and loose.any():
+        tree = cKDTree(points[owned])
+        _, nearest = tree.query(points[loose], distance_upper_bound=_REACH)
+        clusters[loose] = np.append(clusters[owned], 0)[nearest]  # the last: none is near
+
+
+def _join_fragments(
+    clusters: Clusters, image: SurfaceImage, points: PointImage, plane: Plane
+) -> Clusters:
+    """Join a small cluster to a larger one that it touches or in whose footprint it stands."""
+    area = _areas(clusters, image)
+    area[0] = 0.0
+    candidates = np.flatnonzero(area > _MIN_FRAGMENT)
+    order = candidates[np.argsort(-area[candidates], kind="stable")].tolist()
+    members = {c: points[clusters == c] for c in order}
+    reach = {
+        c: _REACH + 3.0 * float(np.median(stereo_noise(image.depth[clusters == c]))) for c in order
+    }
+    axes = plane.axes()
+    owner = np.arange(len(area))
+    for position, big in enumerate(order):
+        if owner[big] != big:
+            continue
+        outline = _footprint(members[big] @ axes.T)
+        for small in order[position + 1 :]:
+            if owner[small] != small:
+                continue
+            flat = members[small] @ axes.T
+            joined = outline is not None and bool(
+                (flat @ outline[:, :2].T + outline[:, 2] <= 0.0).all(axis=1).mean() >= _INSIDE
+            )
+            if not joined and area[small] <= _FRAGMENT * area[big]:
+                joined = _touch(members[big], members[small], reach[small])
+            if joined:
+                owner[small] = big
+    return np.asarray(np.unique(owner[clusters], return_inverse=True)[1]).reshape(clusters.shape)
+
+
+def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
+    """Whether a tenth of the small cluster lies within reach of the big one."""
+    from scipy.spatial import cKDTree
+
+    lower, upper = small.min(axis=0) - reach, small.max(axis=0) + reach
+    near = big[((big >= lower) & (big <= upper)).all(axis=1)]
+    if not len(near):
+        return False
+    gap, _ = cKDTree(near).query(small, distance_upper_bound=reach)
+    return bool(np.isfinite(gap).mean() >= _CONTACT)
+
+
+def _footprint(flat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "f 3"] | None:
+    """Half-planes of the convex hull of a footprint, or None if it has no area."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return np.asarray(ConvexHull(flat).equations)
+    except (QhullError, ValueError):
+        return None
+
+
+def _fill_holes(clusters: Clusters, image: SurfaceImage) -> None:
+    """Add the low pixels that a cluster encloses on its own surface: the bottom of a bowl.
+
+    The table seen through the handle of a cup is enclosed too, but depth jumps there.
+    """
+    from scipy import ndimage
+
+    low = (image.depth > 0) & (clusters == 0) & (image.height > 1.5 * stereo_noise(image.depth))
+    low &= ~jump_pixels(image, reach=1)
+    for cluster, box in enumerate(ndimage.find_objects(clusters), start=1):
+        if box is not None:
+            enclosed = ndimage.binary_fill_holes(clusters[box] == cluster) & low[box]
+            clusters[box][enclosed] = cluster
+
+
+# ------------------------------------------------------------------------------------ valleys
+def _split_at_valleys(
+    height: Values,
+    area: Values,
+    start: Int[np.ndarray, " m"],
+    end: Int[np.ndarray, " m"],
+    min_area: float,
+) -> Indices:
+    """Number the hills of a graph of pixels, 0 = in a valley (belongs to the nearest hill).
+
+    The graph is flooded from below in steps of 5 mm. Where what is still above water
+    falls apart into two pieces or more, each prominent and of at least `min_area`, they are
+    different objects; a piece that is neither is part of the same hill.
+
+    Args:
+        height: metres above the table.
+        area: square metres that each pixel stands for.
+        start: first pixel of each edge.
+        end: second pixel of each edge.
+        min_area: smallest visible area of a hill, square metres.
+    """
+    hills = np.zeros(len(height), dtype=np.int64)
+    piece = components(len(height), start, end)
+    divisible = np.bincount(piece, weights=area) >= 2.0 * min_area
+    order = np.argsort(piece, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
+    found = 0
+    # Largest first; the parts of one that falls apart come at once, the last one first.
+    stack = [(nodes, start, end) for nodes in sorted(groups, key=len, reverse=True)][::-1]
+    while stack:
+        members, first, second = stack.pop()
+        parts: list[np.ndarray] = []
+        if divisible[piece[members[0]]]:
+            inside = np.zeros(len(height), dtype=bool)
+            inside[members] = True
+            within = inside[first] & inside[second]
+            first, second = first[within], second[within]
+            parts = _fall_apart(members, height, area, first, second, min_area)
+        if parts:
+            stack += [(part, first, second) for part in parts]
+        else:
+            found += 1
+            hills[members] = found
+    return hills
+
+
+def _fall_apart(
+    members: Int[np.ndarray, " k"],
+    height: Values,
+    area: Values,
+    start: Int[np.ndarray, " m"],
+    end: Int[np.ndarray, " m"],
+    min_area: float,
+) -> list[np.ndarray]:
+    """Raise the water until two or more prominent pieces are left; [] if that never happens."""
+    heights = height[members]
+    number = np.empty(len(height), dtype=np.int64)
+    for level in np.arange(heights.min() + _STEP, heights.max() - _PROMINENCE, _STEP):
+        dry = members[heights >= level]
+        number[dry] = np.arange(len(dry))
+        above = (height[start] >= level) & (height[end] >= level)
+        start, end = start[above], end[above]
+        piece = components(len(dry), number[start], number[end])
+        size = np.bincount(piece, weights=area[dry])
+        if (size >= min_area).sum() < 2:
+            continue
+        prominent = []
+        for part in np.flatnonzero(size >= min_area):
+            nodes = dry[piece == part]
+            summit = float(np.percentile(height[nodes], 95.0))
+            if summit - level >= max(_PROMINENCE, _RELATIVE_PROMINENCE * summit):
+                prominent.append(nodes)
+        if len(prominent) > 1:
+            return prominent
+    return []

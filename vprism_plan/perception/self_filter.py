@@ -3,42 +3,35 @@
 
 import logging
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from vprism_plan.errors import ConfigError, ObservationError
-from vprism_plan.perception._image_graph import depth_noise, flying_pixels, surface_image
-from vprism_plan.perception._validation import to_numpy
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import (
+    Pixels,
+    Points,
+    Values,
     backproject,
     invert_transform,
     project,
+    stereo_noise,
     transform_points,
 )
-from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.image_graph import flying_pixels, surface_image
+from vprism_plan.perception.observation import Observation, to_numpy
 
 logger = logging.getLogger(__name__)
+
+Balls = Float[np.ndarray, "n 4"]
 
 # A label is the robot's if so much of what it shows is on the robot's surface: within three
 # standard deviations of the depth noise, and 3 mm by which balls miss a solid's edges.
 _OWN_SHARE, _EDGES = 0.9, 0.003
 # Shares from which on a label beside the robot, or seeing through the robot, is odd.
 _MANY, _SEEN_THROUGH = 0.05, 0.1
-
-
-@runtime_checkable
-class SphereRobot(Protocol):
-    """What `ignore_self` needs of a robot."""
-
-    @property
-    def sphere_radii(self) -> Any:
-        """(S,) metres."""
-
-    def sphere_centers(self, q: Any) -> Any:
-        """Torch tensor (dof,) -> (S, 3), world, metres."""
 
 
 def ignore_robot(
@@ -105,7 +98,7 @@ def ignore_robot(
 
 def ignore_self(
     observation: Observation,
-    robot: SphereRobot,
+    robot: Any,
     q: Any,
     padding: float = 0.01,
     *,
@@ -135,7 +128,8 @@ def ignore_self(
     Args:
         observation: Posed in the world in which the robot's base stands, and labelled if it
             will be.
-        robot: A `Robot`; of anything else its `sphere_centers` and `sphere_radii` count.
+        robot: A `Robot`; of anything else `sphere_centers(q)` (torch tensor (dof,) -> (S, 3),
+            world, metres) and `sphere_radii` (S,) count.
         q: (dof,) radians or metres.
         padding: Metres beyond the solids in which a pixel still sees the robot: the error of
             the camera's pose, and of the URDF.
@@ -177,7 +171,7 @@ def ignore_self(
             "<collision> geometry or a mesh"
         )
     inner = solid.inner
-    noise = 3.0 * depth_noise(_in_camera(observation, inner[:, :3])[:, 2])
+    noise = 3.0 * stereo_noise(_in_camera(observation, inner[:, :3])[:, 2])
     marked = _with_balls(marked, inner[:, :3], inner[:, 3] + padding + noise, inner[:, 3])
     if room is not None:
         places, sizes = to_numpy(centers, "centers"), to_numpy(robot.sphere_radii, "radii")
@@ -198,15 +192,12 @@ def _check_metres(name: str, value: float) -> None:
         raise ConfigError(f"{name} is {value}; it must be 0 or more (metres)")
 
 
-def _in_camera(observation: Observation, places: Float[np.ndarray, "s 3"]) -> np.ndarray:
+def _in_camera(observation: Observation, places: Points) -> Points:
     return transform_points(invert_transform(observation.pose), places)
 
 
 def _with_balls(
-    observation: Observation,
-    places: Float[np.ndarray, "s 3"],
-    radii: Float[np.ndarray, " s"],
-    free: Float[np.ndarray, " s"],
+    observation: Observation, places: Points, radii: Values, free: Values
 ) -> Observation:
     """The observation with balls of a robot (world, metres) added to those that it has."""
     rows = np.column_stack([_in_camera(observation, places), radii, free])
@@ -216,9 +207,7 @@ def _with_balls(
     return replace(observation, robot_spheres=rows)
 
 
-def _without_own_labels(
-    observation: Observation, inner: Float[np.ndarray, "s 4"], thick: Float[np.ndarray, " s"]
-) -> Observation:
+def _without_own_labels(observation: Observation, inner: Balls, thick: Values) -> Observation:
     """Take away the labels that are the robot's.
 
     Args:
@@ -229,10 +218,8 @@ def _without_own_labels(
     if observation.labels is None:
         return observation
     labels = observation.labels.copy()
-    points = backproject(observation.depth, observation.intrinsics)
     outer, core = (np.column_stack([inner[:, :3], inner[:, 3] + t]) for t in (thick, -thick))
-    for label in observation.object_ids:
-        own = points[(labels == label) & (observation.depth > 0)]
+    for label, own in _objects(observation):
         on_surface = within_balls(own, outer)
         on_surface[on_surface] = ~within_balls(own[on_surface], core)
         if on_surface.mean() >= _OWN_SHARE:
@@ -240,24 +227,30 @@ def _without_own_labels(
     return replace(observation, labels=labels)
 
 
+def _objects(observation: Observation) -> list[tuple[int, Points]]:
+    """Ids, and points in the camera frame, of the objects."""
+    points = backproject(observation.depth, observation.intrinsics)
+    return [
+        (i, points[(observation.labels == i) & (observation.depth > 0)])
+        for i in observation.object_ids
+    ]
+
+
 def _labels_on_robot(observation: Observation) -> list[str]:
     """Say which objects are seen in or on the robot."""
-    said = []
-    for label in observation.object_ids:
-        own = (observation.labels == label) & (observation.depth > 0)
-        points = backproject(observation.depth, observation.intrinsics)[own]
-        share = float(within_balls(points, observation.robot_spheres[:, :4]).mean())
-        if share > _MANY:
-            said.append(
-                f"{share:.0%} of object {label} is seen in or on the pictured robot, and it stays "
-                "an obstacle; if it is the robot or what that holds, set its label to 0"
-            )
-    return said
+    shares = [
+        (label, float(within_balls(own, observation.robot_spheres[:, :4]).mean()))
+        for label, own in _objects(observation)
+    ]
+    return [
+        f"{share:.0%} of object {label} is seen in or on the pictured robot, and it stays "
+        "an obstacle; if it is the robot or what that holds, set its label to 0"
+        for label, share in shares
+        if share > _MANY
+    ]
 
 
-def _seen_through(
-    observation: Observation, inner: Float[np.ndarray, "s 4"], tolerance: Float[np.ndarray, " s"]
-) -> list[str]:
+def _seen_through(observation: Observation, inner: Balls, tolerance: Values) -> list[str]:
     """Whether the camera saw past places where the robot should have been."""
     pixels, depth = project(inner[:, :3], observation.intrinsics)
     inside = (depth > 0) & (np.nan_to_num(pixels, nan=-1.0) >= 0).all(axis=1)
@@ -287,7 +280,7 @@ def _finished(before: Observation, marked: Observation, remove_flying: bool) -> 
     return marked
 
 
-def _flying_outline(observation: Observation) -> Bool[np.ndarray, "h w"]:
+def _flying_outline(observation: Observation) -> Pixels:
     """Flying pixels within two pixels of one that sees the robot."""
     from scipy import ndimage
 

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.perception import Observation, Plane
-from vprism_plan.perception._table_region import TableRegion, table_region
-from vprism_plan.perception.plane_fitting import inlier_band
+from vprism_plan.perception.camera import inlier_band
+from vprism_plan.perception.plane import TableRegion, table_region
 
 RIM = 0.05  # metres around the seen part of the surface that count as part of it
 _BAND = 0.01  # metres at a depth of 1 m within which a point is of the surface

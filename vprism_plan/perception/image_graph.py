@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
+
+from vprism_plan.perception.camera import Image, Indices, Matrix, Pixels, stereo_noise
 
 # Offsets (rows, columns) of half of the eight neighbours; the other half is symmetric.
 _HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -28,11 +30,6 @@ _LEVEL = 0.15
 Slices = tuple[slice, slice]
 
 
-def depth_noise(depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Return the assumed standard deviation of depth (m): 2 mm at 1 m, growing as depth^2."""
-    return np.asarray(0.002 * np.maximum(0.5, np.asarray(depth, dtype=np.float64)) ** 2)
-
-
 @dataclass(frozen=True, eq=False)
 class SurfaceImage:
     """What the pixel graph needs to know of a view.
@@ -43,9 +40,9 @@ class SurfaceImage:
         pitch: (H, W) metres between neighbouring pixels on a surface that faces the camera.
     """
 
-    depth: Float[np.ndarray, "h w"]
-    height: Float[np.ndarray, "h w"]
-    pitch: Float[np.ndarray, "h w"]
+    depth: Image
+    height: Image
+    pitch: Image
 
     def pairs(
         self, reach: int, slant: float
@@ -65,24 +62,20 @@ class SurfaceImage:
             nearer = np.minimum(self.depth[here], self.depth[there])
             pitch = np.minimum(self.pitch[here], self.pitch[there])
             per_pitch = float(np.hypot(dr, dc) * np.tan(np.radians(slant)))
-            explained = per_pitch * pitch + 2.0 * depth_noise(nearer)
+            explained = per_pitch * pitch + 2.0 * stereo_noise(nearer)
             rise = np.abs(self.height[there] - self.height[here])
             jump = valid & (np.abs(change) > explained) & (rise > _LEVEL * np.abs(change))
             yield here, there, valid, np.where(jump, np.sign(change), 0.0).astype(np.int8)
 
 
-def surface_image(
-    depth: Float[np.ndarray, "h w"],
-    intrinsics: Float[np.ndarray, "3 3"],
-    height: Float[np.ndarray, "h w"],
-) -> SurfaceImage:
+def surface_image(depth: Image, intrinsics: Matrix, height: Image) -> SurfaceImage:
     """Prepare a view for the functions of this module."""
     depth = np.asarray(depth, dtype=np.float64)
     return SurfaceImage(depth, height, depth / min(intrinsics[0, 0], intrinsics[1, 1]))
 
 
 def graph_edges(
-    image: SurfaceImage, mask: Bool[np.ndarray, "h w"]
+    image: SurfaceImage, mask: Pixels
 ) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
     """Return the edges between neighbouring pixels of `mask` on one surface.
 
@@ -97,9 +90,7 @@ def graph_edges(
     return np.concatenate(starts), np.concatenate(ends)
 
 
-def components(
-    count: int, start: Int[np.ndarray, " m"], end: Int[np.ndarray, " m"]
-) -> Int[np.ndarray, " n"]:
+def components(count: int, start: Int[np.ndarray, " m"], end: Int[np.ndarray, " m"]) -> Indices:
     """Number the connected components of a graph, from 0."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -108,7 +99,7 @@ def components(
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def flying_pixels(image: SurfaceImage) -> Bool[np.ndarray, "h w"]:
+def flying_pixels(image: SurfaceImage) -> Pixels:
     """Find pixels that hang in the air between a near and a far surface.
 
     Stereo and time-of-flight cameras blend the two sides of an edge into a short ramp
@@ -121,11 +112,12 @@ def flying_pixels(image: SurfaceImage) -> Bool[np.ndarray, "h w"]:
     from scipy import ndimage
 
     shape = image.depth.shape
-    near = np.zeros(shape, dtype=np.int8)
-    ramp = np.zeros(shape, dtype=bool)
-    for (here, there, valid, step), line in zip(
-        image.pairs(1, _FLYING_SLANT), _lines(_MAX_RAMP + 1), strict=True
-    ):
+    near, ramp = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=bool)
+    diagonal = np.eye(_MAX_RAMP + 1, dtype=bool)
+    row = np.ones((1, _MAX_RAMP + 1), dtype=bool)
+    lines = (row, row.T, diagonal, diagonal[:, ::-1])  # along the directions of `_HALF`
+    pairs = image.pairs(1, _FLYING_SLANT)
+    for (here, there, valid, step), line in zip(pairs, lines, strict=True):
         close = valid & (step == 0)
         near[here] += close
         near[there] += close
@@ -137,18 +129,7 @@ def flying_pixels(image: SurfaceImage) -> Bool[np.ndarray, "h w"]:
     return np.asarray((image.depth > 0) & (ramp | (near < 2)))
 
 
-def _lines(length: int) -> list[Bool[np.ndarray, "r c"]]:
-    """Lines of pixels along the four directions of `_HALF`."""
-    diagonal = np.eye(length, dtype=bool)
-    return [
-        np.ones((1, length), dtype=bool),
-        np.ones((length, 1), dtype=bool),
-        diagonal,
-        diagonal[:, ::-1],
-    ]
-
-
-def jump_pixels(image: SurfaceImage, reach: int = 2) -> Bool[np.ndarray, "h w"]:
+def jump_pixels(image: SurfaceImage, reach: int = 2) -> Pixels:
     """Find the pixels within `reach` of a jump in depth: edges, and all but the mildest ramps.
 
     Cutting the graph here separates objects that the sensor's smoothing glues together.
@@ -160,15 +141,11 @@ def jump_pixels(image: SurfaceImage, reach: int = 2) -> Bool[np.ndarray, "h w"]:
     return jumps
 
 
-def specks(
-    image: SurfaceImage, mask: Bool[np.ndarray, "h w"], max_pixels: int, max_area: float
-) -> Bool[np.ndarray, "h w"]:
+def specks(image: SurfaceImage, mask: Pixels, max_pixels: int, max_area: float) -> Pixels:
     """Find pieces of `mask` that no surface continues: few pixels and a tiny area (m^2)."""
-    start, end = graph_edges(image, mask)
-    piece = components(int(mask.sum()), start, end)
-    pixels = np.bincount(piece)
+    piece = components(int(mask.sum()), *graph_edges(image, mask))
     area = np.bincount(piece, weights=image.pitch[mask] ** 2)
-    small = (pixels <= max_pixels) & (area <= max_area)
+    small = (np.bincount(piece) <= max_pixels) & (area <= max_area)
     result = np.zeros(mask.shape, dtype=bool)
     result[mask] = small[piece]
     return result
