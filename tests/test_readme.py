@@ -11,6 +11,7 @@ def blocks(text, language):
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.S)
 
 
+@pytest.mark.slow
 def test_the_python_example_runs_and_plans(repository):
     code = blocks((repository / "README.md").read_text(), "python")[0]
     assert len(code.strip().splitlines()) <= 15

@@ -212,6 +212,7 @@ def test_the_second_opinion_pads_links_against_the_world_alone(demo_world, robot
         assert all(meshes.is_valid(q) for q in accepted)
 
 
+@pytest.mark.slow
 def test_padding_is_a_distance_to_keep_for_meshes(demo_world, tmp_path):
     """It once took a link's mesh from the second opinion, which then judged its one small ball."""
     block = trimesh.creation.box((0.2, 0.2, 0.3))
