@@ -32,9 +32,11 @@ class NoPlaceError(Exception):
 
 def run_plan(command: Command, console: Console) -> int:
     """Plan and write the results; exit code 0, or 1 without a verified path."""
+    from vprism_plan.planning.planners import planner_kind
     from vprism_plan.robots import Robot
 
-    robot = Robot.from_urdf(command.robot)  # before the long work: the file may be wrong
+    planner_kind(command.planner)  # before the long work, as all that may be wrong
+    robot = Robot.from_urdf(command.robot)
     console.warn(robot.warnings)
     _check_lengths(command, robot)
     config = checks(command, robot)
