@@ -212,6 +212,18 @@ def test_bad_tensors_are_refused(arm, q, message):
         arm.sphere_centers(q)
 
 
+def test_numbers_give_an_array_of_centres_and_tensors_a_tensor(arm):
+    q = [0.2, -0.4]
+    centers = arm.sphere_centers(q)
+    assert isinstance(centers, np.ndarray)
+    in_torch = arm.sphere_centers(torch.tensor([q], dtype=torch.float64))
+    np.testing.assert_array_equal(in_torch[0].numpy(), centers)
+    np.testing.assert_array_equal(arm.sphere_centers(np.array([q, q]))[1], centers)
+    for bad, message in (([1.0], "shape"), ([1.0, np.nan], "NaN"), ("ab", "real numbers")):
+        with pytest.raises(RobotError, match=message):
+            arm.sphere_centers(bad)
+
+
 def test_velocity_limits_of_zero_mean_none_is_stated(gripper):
     np.testing.assert_array_equal(gripper.velocity_limits, [np.inf, 0.1])
     np.testing.assert_array_equal(gripper.neutral, [0.0, 0.01])

@@ -14,7 +14,6 @@ from vprism_plan.viz import (
     resample,
     save_figure,
     scene_figure,
-    sphere_centers,
 )
 from vprism_plan.viz._raster import Film, Layer, View
 
@@ -139,7 +138,7 @@ def test_plan_picture_shows_start_goal_hand_and_objects(demo_map, repository):
     assert hue(plan_plot.HAND_COLOR) > 500
     for object_id in meshes:
         assert hue(object_color(object_id)) > 200
-    centers = sphere_centers(robot, np.stack([start, goal]))
+    centers = robot.sphere_centers(np.stack([start, goal]))
     assert centers.shape == (2, len(robot.sphere_radii), 3)
 
 

@@ -147,14 +147,13 @@ def true_distance(
 
     Also how far any sphere moves between two samples, which bounds what they can miss.
     """
-    from vprism_plan.viz import sphere_centers
 
     moving = ~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
     dense = dense_path(path, 0.0015)
     best, at, largest_step = np.inf, (0, 0), 0.0
     previous: np.ndarray | None = None
     for begin in range(0, len(dense), 256):
-        centers = sphere_centers(robot, dense[begin : begin + 256])[:, moving]
+        centers = robot.sphere_centers(dense[begin : begin + 256])[:, moving]
         gap = truth(centers.reshape(-1, 3)).reshape(centers.shape[:2]) - robot.sphere_radii[moving]
         if gap.min() < best:
             best = float(gap.min())

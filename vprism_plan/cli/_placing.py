@@ -85,12 +85,11 @@ def base_pose(
 
 def stands_free(robot: "Robot", world: "World") -> bool:
     """Return whether the links that never move keep clear of everything but the table."""
-    from vprism_plan.viz import sphere_centers
 
     fixed = np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
     if not fixed.any():
         return True
-    centers = sphere_centers(robot, robot.neutral[None])[0][fixed]
+    centers = robot.sphere_centers(robot.neutral[None])[0][fixed]
     return bool((world.field.lower_bound(centers) > robot.sphere_radii[fixed]).all())
 
 

@@ -40,7 +40,7 @@ from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, loc
 from vprism_plan.robots.urdf import load_model
 
 if TYPE_CHECKING:
-    import torch
+    pass
 
 READY = "ready"
 _logger = logging.getLogger(__name__)
@@ -285,28 +285,26 @@ class Robot:
             f"links: {list(self.link_names)}, groups: {sorted(self.groups)}"
         )
 
-    def sphere_centers(
-        self, q: Float[torch.Tensor, "*batch dof"]
-    ) -> Float[torch.Tensor, "*batch spheres 3"]:
-        """World centres of the collision spheres.
+    def sphere_centers(self, q: Any) -> Any:
+        """World centres of the collision spheres, (..., spheres, 3), metres.
 
         Args:
-            q: Configurations, float32 or float64, any device and batch shape.
+            q: configurations (..., dof): numbers or an array, or a tensor of float32 or float64
+                on any device.
 
         Returns:
-            Centres in metres, same dtype and device, differentiable in q to any order.
-            Batched already: torch.vmap over it is not supported.
+            An array, float64; for a tensor a tensor of its dtype and device, differentiable in
+            q to any order. Batched already: torch.vmap over it is not supported.
 
         Raises:
-            RobotError: q has another dtype, a wrong last dimension, or values that
-                are not finite.
+            RobotError: q is not numbers, has another dtype, a wrong last dimension, or values
+                that are not finite.
         """
         import torch
 
         if not isinstance(q, torch.Tensor):
-            raise RobotError(
-                f"q is a {type(q).__name__}; give a tensor: torch.as_tensor(q, dtype=torch.float64)"
-            )
+            with torch.no_grad():
+                return self.sphere_centers(torch.tensor(joint_values(q, self, "q"))).numpy()
         if q.ndim == 0 or q.shape[-1] != self.dof:
             raise RobotError(f"q has shape {tuple(q.shape)}; expected {self._expected('(..., ')}")
         if not bool(torch.isfinite(q.detach()).all()):

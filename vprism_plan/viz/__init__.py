@@ -4,7 +4,7 @@
 from vprism_plan.viz._figures import object_color, save_figure
 from vprism_plan.viz.map_plot import map_figure
 from vprism_plan.viz.margin_plot import margin_figure
-from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample, sphere_centers
+from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample
 from vprism_plan.viz.risk_plot import risk_figure
 from vprism_plan.viz.robot_plot import robot_figure
 from vprism_plan.viz.scene_plot import scene_figure
@@ -21,6 +21,5 @@ __all__ = [
     "robot_figure",
     "save_figure",
     "scene_figure",
-    "sphere_centers",
     "trajopt_figure",
 ]

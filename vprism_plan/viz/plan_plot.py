@@ -72,7 +72,7 @@ def plan_figure(
     dense = resample(path, 120)
     stage = _Stage(
         meshes,
-        sphere_centers(robot, dense),
+        robot.sphere_centers(dense),
         np.asarray(robot.sphere_radii),
         np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)],
         hand_path(robot, dense),
@@ -203,18 +203,10 @@ def resample(path: Float[np.ndarray, "t dof"], count: int) -> Float[np.ndarray, 
     return np.stack([np.interp(at, along, column) for column in path.T], axis=1)
 
 
-def sphere_centers(robot: "Robot", path: Float[np.ndarray, "t dof"]) -> Float[np.ndarray, "t s 3"]:
-    """Return the world centres (metres) of all collision spheres along a path."""
-    import torch
-
-    with torch.no_grad():
-        return robot.sphere_centers(torch.as_tensor(path, dtype=torch.float64)).numpy()
-
-
 def hand_path(robot: "Robot", path: Float[np.ndarray, "t dof"]) -> Float[np.ndarray, "t 3"]:
     """Return the middle of the last link's spheres along a path, world frame, metres."""
     last = int(np.max(robot.sphere_links))
-    return sphere_centers(robot, path)[:, np.asarray(robot.sphere_links) == last].mean(axis=1)
+    return robot.sphere_centers(path)[:, np.asarray(robot.sphere_links) == last].mean(axis=1)
 
 
 def _legend(figure: Figure, meshes: "Mapping[int, trimesh.Trimesh]") -> None:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from vprism_plan.viz._figures import new_figure
 from vprism_plan.viz.map_plot import Slice, occluded, overlay
-from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path, sphere_centers
+from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path
 
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
@@ -135,7 +135,7 @@ class _Sweep:
     def of(cls, robot: Any, path: np.ndarray, plane: Slice) -> "_Sweep":
         dense, _ = densified(path, _POSES)
         moving = ~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
-        centers = sphere_centers(robot, dense)[:, moving]
+        centers = robot.sphere_centers(dense)[:, moving]
         radii = np.asarray(robot.sphere_radii)[moving]
         hand = hand_path(robot, dense)[:, :2]
         return cls(

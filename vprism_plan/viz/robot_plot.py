@@ -62,10 +62,7 @@ def robot_figure(robot: "Robot", q: Any = None, *, title: str | None = None) -> 
 
 def _spheres(robot: "Robot", q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """World centres, radii and links' indices, without padding and scale."""
-    import torch
-
-    with torch.no_grad():
-        checked = robot.sphere_centers(torch.as_tensor(q, dtype=torch.float64)).numpy()
+    checked = robot.sphere_centers(q)
     poses = robot.link_poses(q)
     parts = []
     for index, link in enumerate(robot.link_names):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from vprism_plan.errors import ConfigError, MissingDependencyError
 from vprism_plan.viz._figures import object_color
 from vprism_plan.viz._viewer_parts import EntropyVolume, place_solids, robot_solids, to_bytes
-from vprism_plan.viz.plan_plot import hand_path, sphere_centers
+from vprism_plan.viz.plan_plot import hand_path
 
 if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
@@ -153,7 +153,7 @@ class Viewer:
         assert self.robot is not None
         q = self.robot.check_configuration(q)
         with self._lock, self.server.atomic():
-            centers = sphere_centers(self.robot, q[None])[0]
+            centers = self.robot.sphere_centers(q[None])[0]
             self.nodes["/robot/spheres"].batched_positions = centers.astype(np.float32)
             for name, (wxyz, position) in place_solids(self.robot, self._solids, q).items():
                 self.nodes[name].wxyz, self.nodes[name].position = wxyz, position

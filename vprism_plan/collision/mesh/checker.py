@@ -22,7 +22,7 @@ from vprism_plan.collision.inputs import Numbers, configuration, configurations
 from vprism_plan.collision.mesh.comparison import PathFinding, PathOpinion, causes_between
 from vprism_plan.collision.mesh.fcl import fcl
 from vprism_plan.collision.mesh.queries import Queries
-from vprism_plan.collision.mesh.solids import LinkShapes, PlacedSolids, robot_solids, sphere_centers
+from vprism_plan.collision.mesh.solids import LinkShapes, PlacedSolids, robot_solids
 from vprism_plan.collision.mesh.world import MeshWorld
 from vprism_plan.collision.reports import Contact, MotionReport, StateReport
 from vprism_plan.errors import ConfigError, RobotError
@@ -217,7 +217,7 @@ class MeshChecker:
             RobotError: q does not have shape (dof,).
         """
         q = configuration(self.robot, q)
-        centers = partial(sphere_centers, self.robot)
+        centers = self.robot.sphere_centers
         return explain.report(self, q, self.contacts, self._permitted, centers)
 
     def contacts(self, q: Numbers) -> tuple[Contact, ...]:

@@ -12,7 +12,6 @@ from jaxtyping import Float
 from vprism_plan.collision.inputs import Numbers, configurations
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import SEEN
-from vprism_plan.collision.mesh.solids import sphere_centers
 from vprism_plan.collision.reports import Contact
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
@@ -264,7 +263,7 @@ def _of_surface(
 ) -> tuple[CauseKind, float]:
     """Cause and amount where the field refuses a sphere for an object or known geometry."""
     margin = float(checker.config.margin)
-    center = sphere_centers(meshes.robot, q)[contact.sphere]
+    center = meshes.robot.sphere_centers(q)[contact.sphere]
     radius = float(meshes.robot.sphere_radii[contact.sphere])
     gap = _ball_gap(meshes, center, radius, contact.body)
     left = meshes.link_distance(q, contact.link, contact.body)
@@ -364,7 +363,7 @@ def _in_spheres(
     solids are, to FCL's tolerance."""
     point, apart = np.array(contact.position), max(0.0, contact.required - contact.depth)
     robot = meshes.robot
-    away = np.linalg.norm(sphere_centers(robot, q) - point, axis=1)
+    away = np.linalg.norm(robot.sphere_centers(q) - point, axis=1)
     held = away <= robot.sphere_radii + apart + _TOLERANCE
     owners = {robot.link_names[int(link)] for link in robot.sphere_links[held]}
     return owners >= set(links)

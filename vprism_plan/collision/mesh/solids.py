@@ -125,16 +125,9 @@ def _primitives(robot: Robot, link: int) -> list[Solid]:
     return [_primitive(link, replace(solid, padding=0.0)) for solid in solids]
 
 
-def sphere_centers(robot: Robot, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
-    """World centres of all collision spheres, metres."""
-    import torch
-
-    return np.asarray(robot.sphere_centers(torch.from_numpy(q)).numpy())
-
-
 def _spheres_in_links(robot: Robot) -> Float[np.ndarray, "s 3"]:
     """Sphere centres in their links' frames: they do not depend on the configuration."""
-    world, poses = sphere_centers(robot, robot.neutral), robot.link_poses(robot.neutral)
+    world, poses = robot.sphere_centers(robot.neutral), robot.link_poses(robot.neutral)
     of_link = [poses[robot.link_names[int(link)]] for link in robot.sphere_links]
     return np.array(
         [T[:3, :3].T @ (x - T[:3, 3]) for T, x in zip(of_link, world, strict=True)]
