@@ -278,9 +278,9 @@ def test_what_is_no_configuration_is_refused_by_name(fresh, kind):
             vp.plan(checker, start, goal)
 
 
-@pytest.mark.parametrize("q", [np.zeros(3), [0.0, 0.0, 0.0]])
-def test_sphere_centers_of_what_is_no_tensor_are_refused(arm, q):
-    with pytest.raises((RobotError, TypeCheckError), match=r"as_tensor|parameter"):
+@pytest.mark.parametrize("q", ["abc", [1j, 0.0, 0.0], [[0.0], [0.0, 1.0]]])
+def test_sphere_centers_of_what_are_no_numbers_are_refused(arm, q):
+    with pytest.raises((RobotError, TypeCheckError), match=r"cannot be read|parameter"):
         arm.sphere_centers(q)
 
 
