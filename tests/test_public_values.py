@@ -17,6 +17,7 @@ from jaxtyping import TypeCheckError
 from oracles.small_scenes import at, small_map
 
 import vprism_plan as vp
+from vprism_plan import trajopt
 from vprism_plan.collision import RiskEstimate
 from vprism_plan.errors import ConfigError, MapError, ObservationError, PlanningError, RobotError
 from vprism_plan.planning import PlanReport, PlanResult, last_valid
@@ -227,8 +228,15 @@ def test_no_kernel_is_compiled_for_read_only_arrays(fresh, arm):
     checker.max_safe_motion(low, 0.01 * high)
     checker.path_entropy(low)
     last_valid(checker, low, high)
+    points = np.broadcast_to([0.1, 0.0, 0.2], (2, 3))
+    for some in (points, points[:1]):
+        checker.world.map.predict_proba(some)
+        checker.world.map.occupancy_log_odds(some)
+        checker.world.field.lower_bound(some)
+        checker.world.status(some)
+        checker.world.posterior_worlds(64).touched(some, 0.02)
     vp.plan(checker, low, arm.neutral, time_limit=0.05)
-    vp.trajopt.ClearanceCost(checker)(torch.zeros(1, 3, arm.dof))
+    trajopt.ClearanceCost(checker)(torch.zeros(1, 3, arm.dof))
     for name, module in list(sys.modules.items()):
         if not name.startswith("vprism_plan._kernels."):
             continue

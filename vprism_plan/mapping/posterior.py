@@ -308,7 +308,7 @@ def _check_shape(shape: tuple[int, ...]) -> None:
 
 def _checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
     try:
-        array = np.ascontiguousarray(points, dtype=np.float64)
+        array = np.require(points, np.float64, ["C", "W"])
     except (TypeError, ValueError) as error:
         raise MapError(f"points cannot be read as numbers: {error}; pass (N, 3) metres") from error
     _check_shape(array.shape)

@@ -199,8 +199,9 @@ class DistanceField:
 
 
 def checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
-    """Contiguous float64 points (n, 3); WorldError if they are not that, or not finite."""
-    array = np.ascontiguousarray(points, dtype=np.float64)
+    """Contiguous, writeable float64 points (n, 3) as kernels take them; WorldError if they are
+    not that, or not finite."""
+    array = np.require(points, np.float64, ["C", "W"])
     if array.ndim != 2 or array.shape[1] != 3:
         raise WorldError(f"points have shape {array.shape}; they must be (n, 3), metres")
     if not np.isfinite(array).all():

@@ -201,7 +201,7 @@ class PosteriorWorlds:
             WorldError: not finite, a radius that `reach` does not cover, an unknown object.
         """
         centers = checked_points(centers)
-        radii = np.ascontiguousarray(np.broadcast_to(radii, len(centers)), dtype=np.float64)
+        radii = np.array(np.broadcast_to(radii, len(centers)), dtype=np.float64)
         self.require_reach(radii)
         rule = self.rule(without)
         out = np.empty((len(centers), self.n_worlds), np.bool_)
