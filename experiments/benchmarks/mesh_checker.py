@@ -9,9 +9,9 @@ Everything is timed in one run, in turns, and the ratios of the medians are prin
 import time
 
 import numpy as np
-from checking import demo_checker
 
 import vprism_plan as vp
+from experiments.benchmarks.checking import demo_checker
 from vprism_plan.collision import compare
 
 ROUNDS = 7

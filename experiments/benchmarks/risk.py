@@ -11,9 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from checking import demo_checker
 
 import vprism_plan as vp
+from experiments.benchmarks.checking import demo_checker
 
 ROUNDS = 15
 CONFIGURATIONS = 500

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What scripts of benchmarks/ keep between runs is taken again only if it answers the question."""
 
+import importlib
 import importlib.util
 import json
 from pathlib import Path
@@ -92,3 +93,9 @@ def test_kept_scenes_were_taken_again_after_the_code_changed(calibration, tmp_pa
     calibration.one_scene(7, config, 3, keep)
     assert calibration.asked == [7, 7, 7]
     assert json.loads(keep.read_text())["asked"]["paths"] == 3
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in BENCHMARKS.glob("[!_]*.py")))
+def test_every_benchmark_can_be_loaded_as_a_module(name):
+    """Two imported a neighbour by its bare name, which works for a script alone."""
+    assert callable(importlib.import_module(f"experiments.benchmarks.{name}").main)

@@ -159,7 +159,12 @@ class Sweep:
 def count_path(at: Setting, path: Float[np.ndarray, "t dof"]) -> Sweep:
     """Sample a path without gaps and count the worlds that it touches."""
     if len(path) == 1:
-        return count_each(at, path)
+        centers, hits = count_at(at, path[0])
+        if hits:
+            return count_each(at, path)
+        n, none = at.worlds.n_worlds, np.zeros(1, np.int64)  # most places: nothing to say of worlds
+        slack, touched = np.zeros((1, len(at.radii))), np.zeros(n, np.uint8)
+        return Sweep(centers[None], slack, none, touched, none, np.full(n, -1))
     steps = np.empty(len(path) - 1, np.int64)
     n = int(checking.count_steps(path, at.floats, at.ints, at.spacing, steps)) + 1
     if n > AT_MOST:
