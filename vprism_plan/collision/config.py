@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from vprism_plan._numbers import is_number, is_whole
+from vprism_plan._arguments import is_number, is_whole
 from vprism_plan.errors import ConfigError
 
 # What each number must be, in words and as a test that nan fails.

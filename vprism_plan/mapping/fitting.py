@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from vprism_plan._numbers import is_whole
+from vprism_plan._arguments import is_whole
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior, Prior, expand_prior, fit_weights, weight_prior

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vprism_plan._numbers import is_number
+from vprism_plan._arguments import is_number
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.attempts import Query, attempt, within_risk
 from vprism_plan.planning.goals import (

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ompl import base as ob
 from ompl import util as ou
 
-from vprism_plan._numbers import is_number, is_whole
+from vprism_plan._arguments import is_number, is_whole
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.objectives import PathCost, make_objective
 from vprism_plan.planning.ompl_adapter import (

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan._files import read_json, reading, write_text
-from vprism_plan._numbers import is_whole
+from vprism_plan._arguments import is_whole
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.protocols import Configuration
 
