@@ -20,8 +20,8 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 from scipy.spatial import cKDTree
 
-from vprism_plan._files import reading, replacing
 from vprism_plan._arguments import is_whole
+from vprism_plan._files import reading, replacing
 from vprism_plan.errors import ConfigError, MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior

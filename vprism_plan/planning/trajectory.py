@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from vprism_plan._files import read_json, reading, write_text
 from vprism_plan._arguments import is_whole
+from vprism_plan._files import read_json, reading, write_text
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.protocols import Configuration
 
