@@ -83,7 +83,7 @@ def choice(
 def rigid_pose(
     name: str, value: Any, *, error: type[VPrismError] = ConfigError
 ) -> Float[np.ndarray, "4 4"]:
-    """Return a fresh (4, 4) float64 proper rigid transform, its rotation orthonormal to rounding."""
+    """Return a fresh (4, 4) float64 proper rigid transform; errors say how far it is from one."""
     try:
         pose = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as cause:
@@ -98,6 +98,6 @@ def rigid_pose(
         raise error(
             f"{name} is not rigid: its rotation is off orthonormal by {drift:.3g} (at most "
             f"{_ORTHONORMAL:g}), with determinant {np.linalg.det(rotation):.6g} (expected 1) and "
-            f"last row {pose[3].tolist()} (expected [0, 0, 0, 1]); remove scale, shear and mirroring"
+            f"last row {pose[3].tolist()} (expected [0, 0, 0, 1]); remove scale, shear, mirrors"
         )
     return pose
