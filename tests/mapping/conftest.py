@@ -64,13 +64,13 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="session")
 def small_map(scene: Scene) -> VPrismMap:
-    return fit_map(scene.observation, COARSE, seed=1)
+    return fit_map(scene.observation, COARSE, seed=1, prior=None)
 
 
 @pytest.fixture(scope="session")
 def default_map(scene: Scene) -> VPrismMap:
     """The same scene with the default preset, for what is said about its accuracy."""
-    return fit_map(scene.observation)
+    return fit_map(scene.observation, prior=None)
 
 
 @pytest.fixture(scope="session")

@@ -39,6 +39,24 @@ def test_agrees_with_the_textbook_without_a_cutoff(make, classes, updates):
     np.testing.assert_allclose(ours.history, theirs.bounds, rtol=1e-9)
 
 
+@pytest.mark.parametrize("classes", [2, 5])
+def test_agrees_with_the_textbook_around_an_offset(make, classes):
+    """What is added to the logits is learned around, as if it were a feature of weight 1."""
+    problem = make(classes, classes, cutoff=0)
+    offset = np.random.default_rng(classes).normal(scale=3.0, size=(len(problem.points), classes))
+    prior = diagonal_prior(problem.space, problem.prior_mean, problem.variance)
+    ours = fit_weights(
+        problem.space, block_features(problem.space, problem.points), problem.labels, prior,
+        iterations=4, variational_updates=2, offset=offset,
+    )  # fmt: skip
+    phi = dense_em.features(problem.points, problem.space.hinges, problem.space.gamma, np.inf)
+    dense = np.stack([np.diag(problem.variance)] * classes)
+    theirs = dense_em.fit(phi, problem.labels, problem.prior_mean.T, dense, 4, 2, offset)
+    assert relative(ours.mean.T, theirs.mean) < 1e-6
+    np.testing.assert_allclose(ours.history, theirs.bounds, rtol=1e-9)
+    assert (np.diff(ours.history) > 0).all()
+
+
 def test_agrees_with_the_textbook_at_the_same_cutoff(make):
     """Same truncated features: the posterior is the same wherever a query can look."""
     problem = make(4, 4, n=300, hinges=60)

@@ -8,7 +8,7 @@ import pytest
 
 from vprism_plan.errors import MapError, ObservationError, PlaneNotFoundError
 from vprism_plan.mapping import MapConfig, fit_map
-from vprism_plan.mapping.em import expand_prior
+from vprism_plan.mapping.em import expand_prior, weight_prior
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.fitting import training_data
 from vprism_plan.mapping.posterior import VPrismMap
@@ -126,7 +126,8 @@ def test_an_update_keeps_old_hinges_and_gives_new_ground_the_prior(small_map):
     from vprism_plan.mapping.features import sorted_hinges
 
     space = FeatureSpace(sorted_hinges(np.concatenate([old.hinges, extra])), old.gamma, old.radius)
-    prior = expand_prior(old, small_map.posterior, space, small_map.config)
+    flat = weight_prior(space, small_map.config, small_map.n_classes)
+    prior = expand_prior(old, small_map.posterior, space, flat)
     from vprism_plan.mapping.factors import dense_class
 
     order = [int(np.flatnonzero((space.hinges == h).all(1))[0]) for h in old.hinges]

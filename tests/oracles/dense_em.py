@@ -53,8 +53,9 @@ def fit(
     prior_covariance: np.ndarray,
     iterations: int,
     variational_updates: int = 1,
+    offset: np.ndarray | None = None,
 ) -> DensePosterior:
-    """Algorithm 1. `prior_mean` (K, M), `prior_covariance` (K, M, M)."""
+    """Algorithm 1. `prior_mean` (K, M), `prior_covariance` (K, M, M); z = offset + phi W."""
     n, size = phi.shape
     classes = len(prior_mean)
     y = np.eye(classes)[labels]
@@ -63,6 +64,7 @@ def fit(
     mean = np.empty((classes, size))
     covariance = np.empty((classes, size, size))
     bounds = []
+    o = np.zeros((n, classes)) if offset is None else offset
     for _ in range(iterations):
         weight = np.vectorize(lam)(xi)
         for k in range(classes):
@@ -71,10 +73,11 @@ def fit(
             information = prior_precision @ prior_mean[k]
             for i in range(n):
                 precision += 2.0 * weight[i, k] * np.outer(phi[i], phi[i])
-                information = information + (y[i, k] - 0.5 + 2.0 * alpha[i] * weight[i, k]) * phi[i]
+                linear = y[i, k] - 0.5 + 2.0 * (alpha[i] - o[i, k]) * weight[i, k]
+                information = information + linear * phi[i]
             covariance[k] = np.linalg.inv(precision)
             mean[k] = np.linalg.solve(precision, information)
-        m = phi @ mean.T
+        m = o + phi @ mean.T
         v = np.stack([np.einsum("im,mj,ij->i", phi, s, phi) for s in covariance], axis=1)
         for _ in range(variational_updates):
             weight = np.vectorize(lam)(xi)

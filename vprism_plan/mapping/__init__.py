@@ -4,6 +4,7 @@
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.fitting import fit_map
 from vprism_plan.mapping.posterior import VPrismMap
+from vprism_plan.mapping.prior import MeshPrior
 from vprism_plan.mapping.serialization import load_map
 
-__all__ = ["MapConfig", "VPrismMap", "fit_map", "load_map"]
+__all__ = ["MapConfig", "MeshPrior", "VPrismMap", "fit_map", "load_map"]

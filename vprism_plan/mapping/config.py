@@ -2,68 +2,31 @@
 """Every number the map depends on, in one frozen and validated place."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal, get_args
 
+from vprism_plan._arguments import choice, number, whole
 from vprism_plan.errors import ConfigError
 
 RaySampling = Literal["stratified", "steps", "whole"]
 
 
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-_POSITIVE = ("a finite number above 0", lambda v: _finite(v) and v > 0)
-_NON_NEGATIVE = ("a finite number of at least 0", lambda v: _finite(v) and v >= 0)
-_PROBABILITY = ("strictly between 0 and 1", lambda v: _finite(v) and 0 < v < 1)
-
-
-def _whole(minimum: int) -> tuple[str, Callable[[object], bool]]:
-    return (
-        f"a whole number of at least {minimum}",
-        lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= minimum,
-    )
-
-
-_RULES: dict[str, tuple[str, Callable]] = {
-    "gamma": _POSITIVE,
-    "kernel_cutoff": _PROBABILITY,
-    "hinge_spacing": _POSITIVE,
-    "hinge_radius": _POSITIVE,
-    "hinge_margin": _NON_NEGATIVE,
-    "hinge_depth": _NON_NEGATIVE,
-    "hinge_reach": _NON_NEGATIVE,
-    "box_trim": ("at least 0 and below 0.25", lambda v: _finite(v) and 0 <= v < 0.25),
-    "stray_share": ("at least 0 and below 1", lambda v: _finite(v) and 0 <= v < 1),
-    "surface_hinges": _whole(0),
-    "iterations": _whole(1),
-    "variational_updates": _whole(1),
-    "relaxation": ("at least 1 and below 2", lambda v: _finite(v) and 1 <= v < 2),
-    "tolerance": _NON_NEGATIVE,
-    "prior_logit_variance": _POSITIVE,
-    "prior_weight_variance": _POSITIVE,
-    "bias_variance": _POSITIVE,
-    "prior_occupancy": _PROBABILITY,
-    "object_radius": _POSITIVE,
-    "ray_step": _POSITIVE,
-    "ray_sampling": (
-        "one of " + ", ".join(map(repr, get_args(RaySampling))),
-        lambda v: v in get_args(RaySampling),
-    ),
-    "below_plane_samples": _whole(0),
-    "below_plane_margin": _NON_NEGATIVE,
-    "object_resolution": _POSITIVE,
-    "empty_resolution": _POSITIVE,
-    "front_distance": _POSITIVE,
-    "front_resolution": _POSITIVE,
-    "max_points": _whole(1),
-    "max_hinges": _whole(1),
-}
+_POSITIVE = (
+    "gamma", "hinge_spacing", "hinge_radius", "prior_logit_variance", "prior_weight_variance",
+    "prior_seen_variance", "prior_hidden_variance", "bias_variance", "object_radius", "ray_step",
+    "object_resolution", "empty_resolution", "front_distance", "front_resolution",
+)  # fmt: skip
+_NOT_NEGATIVE = (
+    "hinge_margin", "hinge_depth", "hinge_reach", "tolerance", "below_plane_margin",
+)  # fmt: skip
+_WHOLE = {
+    "surface_hinges": 0, "iterations": 1, "variational_updates": 1, "below_plane_samples": 0,
+    "max_points": 1, "max_hinges": 1,
+}  # fmt: skip
 _OPTIONAL = frozenset(
     {"hinge_depth", "prior_logit_variance", "prior_weight_variance", "prior_occupancy"}
     | {"front_distance", "hinge_reach", "object_resolution", "empty_resolution"}
+    | {"prior_hidden_variance"}
 )
 
 
@@ -118,6 +81,11 @@ class MapConfig:
             means the same at every spacing.
         prior_weight_variance: the same stated on the weights (the paper). Exactly one
             of the two is set.
+        prior_seen_variance, prior_hidden_variance: prior variance of a logit where a prior
+            guesses its mean: of nodes in front of what was seen, and of those behind it.
+            With None for the latter no prior is asked (the paper).
+        prior_depths: between these depths behind what was seen, m, the variance changes
+            from the one to the other.
         bias_variance: prior variance of the bias weight. The bias is all that acts
             where no hinge reaches; left free, it learns the mix of the training points
             and then claims to know unseen space. The default pins it to its prior mean.
@@ -159,6 +127,9 @@ class MapConfig:
     tolerance: float = 1e-5
     prior_logit_variance: float | None = 20.0
     prior_weight_variance: float | None = None
+    prior_seen_variance: float = 10.0
+    prior_hidden_variance: float | None = 0.25
+    prior_depths: tuple[float, float] = (-0.01, 0.02)
     bias_variance: float = 1e-8
     prior_occupancy: float | None = 0.2
     object_radius: float = 0.25
@@ -173,19 +144,31 @@ class MapConfig:
     max_points: int = 150_000
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name not in _RULES or (value is None and field.name in _OPTIONAL):
+        for name, value in vars(self).items():
+            given = f"MapConfig.{name}"
+            if value is None and name in _OPTIONAL:
                 continue
-            valid, holds = _RULES[field.name]
-            if not holds(value):
-                raise ConfigError(f"MapConfig.{field.name} is {value!r}; it must be {valid}")
-        shift = tuple(self.hinge_shift)
-        if len(shift) != 3 or not all(_finite(s) for s in shift):
+            if name in _POSITIVE:
+                number(given, value, 0.0, above=True)
+            elif name in _NOT_NEGATIVE:
+                number(given, value, 0.0)
+            elif name in _WHOLE:
+                whole(given, value, _WHOLE[name])
+            elif name in {"kernel_cutoff", "prior_occupancy"}:
+                number(given, value, 0.0, 1.0, above=True, below=True)
+        number("MapConfig.box_trim", self.box_trim, 0.0, 0.25, below=True)
+        number("MapConfig.stray_share", self.stray_share, 0.0, 1.0, below=True)
+        number("MapConfig.relaxation", self.relaxation, 1.0, 2.0, below=True)
+        choice("MapConfig.ray_sampling", self.ray_sampling, get_args(RaySampling))
+        for name, count in (("hinge_shift", 3), ("prior_depths", 2)):
+            lengths = tuple(number(f"MapConfig.{name}", v, unit="m") for v in getattr(self, name))
+            if len(lengths) != count:
+                raise ConfigError(f"MapConfig.{name} is {lengths}; it must be {count} lengths (m)")
+            object.__setattr__(self, name, lengths)
+        if not self.prior_depths[0] < self.prior_depths[1]:
             raise ConfigError(
-                f"MapConfig.hinge_shift is {self.hinge_shift!r}; it must be three lengths (m)"
+                f"MapConfig.prior_depths is {self.prior_depths}; the first must be the smaller"
             )
-        object.__setattr__(self, "hinge_shift", tuple(float(s) for s in shift))
         if (self.prior_logit_variance is None) == (self.prior_weight_variance is None):
             raise ConfigError(
                 "MapConfig takes exactly one of prior_logit_variance "
@@ -221,6 +204,9 @@ class MapConfig:
             tolerance=0.0,
             prior_logit_variance=None,
             prior_weight_variance=1e4,
+            prior_seen_variance=10.0,
+            prior_hidden_variance=None,
+            prior_depths=(-0.01, 0.02),
             bias_variance=1e4,
             prior_occupancy=None,
             object_radius=0.25,

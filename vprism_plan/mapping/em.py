@@ -22,7 +22,7 @@ from vprism_plan.mapping.features import BlockFeatures, FeatureSpace
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class WeightPrior:
     """Gaussian prior of every class's weights.
 
     Attributes:
@@ -49,12 +49,12 @@ class Posterior:
 
 def diagonal_prior(
     space: FeatureSpace, mean: Float[np.ndarray, "m k"], variance: Float[np.ndarray, " m"]
-) -> Prior:
+) -> WeightPrior:
     """Return independent weights with the given means, and variances shared by the classes."""
     classes = mean.shape[1]
     precision = np.zeros((space.envelope_size, classes))
     precision[space.diagonal] = (1.0 / variance)[:, None]
-    return Prior(mean, precision, np.full(classes, -np.log(variance).sum()))
+    return WeightPrior(mean, precision, np.full(classes, -np.log(variance).sum()))
 
 
 def bouchard_lambda(xi: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -97,7 +97,7 @@ def expected_bound(
     return float((own - alpha - terms.sum(axis=1)).sum())
 
 
-def divergence(space: FeatureSpace, posterior: Posterior, prior: Prior) -> float:
+def divergence(space: FeatureSpace, posterior: Posterior, prior: WeightPrior) -> float:
     """Sum over classes of the Kullback-Leibler divergence of the posterior from the prior."""
     classes = prior.mean.shape[1]
     trace = np.empty(classes)
@@ -180,16 +180,18 @@ def fit_weights(
     space: FeatureSpace,
     features: BlockFeatures,
     labels: Int[np.ndarray, " n"],
-    prior: Prior,
+    prior: WeightPrior,
     *,
     iterations: int,
     variational_updates: int = 1,
     tolerance: float = 0.0,
     relaxation: float = 1.0,
+    offset: Float[np.ndarray, "n k"] | None = None,
 ) -> Posterior:
     """Run EM from xi = 1, alpha = 0 and return the posterior of all classes.
 
-    `labels` (class per point, 0 is empty) follow the points as given, not the blocks.
+    `labels` (class per point, 0 is empty) and `offset` (what is added to every point's
+    logits) follow the points as given, not the blocks.
     Stops after `iterations`, or when the bound rises by less than `tolerance` of itself.
 
     `relaxation` above 1 goes that many times as far as a step of EM: xi by the power of
@@ -211,6 +213,7 @@ def fit_weights(
     kernels.envelope_product(
         prior.precision, space.row_first, space.base, prior.mean, prior_information
     )
+    offset = np.zeros((1, classes)) if offset is None else offset[features.order]
     used = _Variational(np.zeros(len(labels)), np.ones((len(labels), classes)))
     plain, relaxed = used, False
     history: list[float] = []
@@ -220,12 +223,13 @@ def fit_weights(
         precision = prior.precision.copy()
         _accumulate(space, features, 2.0 * weight, precision)
         information = prior_information.copy()
-        linear = one_hot - 0.5 + 2.0 * used.alpha[:, None] * weight
+        linear = one_hot - 0.5 + 2.0 * (used.alpha[:, None] - offset) * weight
         kernels.feature_sums(*features.arguments, linear, information)
         mean, covariance = np.empty_like(prior.mean), np.empty_like(prior.precision)
         log_determinant = invert_classes(space, precision, information, mean, covariance)
         found = Posterior(mean, covariance, precision, log_determinant, ())
         m, v = logit_moments(space, features, mean, covariance)
+        m += offset
         for _ in range(variational_updates):
             alpha = update_alpha(m, weight)
             xi = update_xi(m, v, alpha)
@@ -275,7 +279,7 @@ def prior_means(config: MapConfig, classes: int) -> tuple[float, float]:
     return (inside - outside) / config.mean_feature_sum, outside
 
 
-def weight_prior(space: FeatureSpace, config: MapConfig, classes: int) -> Prior:
+def weight_prior(space: FeatureSpace, config: MapConfig, classes: int) -> WeightPrior:
     """Return the prior of all weights, (M, K), independent between features and classes."""
     mean = np.zeros((space.size, classes))
     mean[:-1, 0], mean[-1, 0] = prior_means(config, classes)
@@ -293,14 +297,13 @@ def expand_prior(
     old_space: FeatureSpace,
     old: Posterior,
     space: FeatureSpace,
-    config: MapConfig,
-) -> Prior:
+    fresh: WeightPrior,
+) -> WeightPrior:
     """Make the old posterior the prior of a larger feature space.
 
     Hinges of `space` that the old one has keep their joint posterior; the others enter
-    independent, with the configured prior.
+    independent, with `fresh`, a diagonal prior of all of `space`.
     """
-    fresh = weight_prior(space, config, old.mean.shape[1])
     position = {row.tobytes(): i for i, row in enumerate(space.hinges)}
     kept = [position[row.tobytes()] for row in old_space.hinges]
     target = np.array([*kept, space.size - 1], dtype=np.int64)
@@ -315,5 +318,5 @@ def expand_prior(
     precision[space.base[high[stored]] + low[stored]] = old.precision[stored]
     added = np.ones(space.size, dtype=bool)
     added[target] = False
-    variance = weight_variances(space, config)
-    return Prior(mean, precision, old.log_determinant - np.log(variance[added]).sum())
+    gained = np.log(fresh.precision[space.diagonal][added]).sum(axis=0)
+    return WeightPrior(mean, precision, old.log_determinant + gained)

@@ -9,13 +9,28 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
-from vprism_plan._arguments import is_whole
+from vprism_plan._arguments import choice, is_whole
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior, Prior, expand_prior, fit_weights, weight_prior
+from vprism_plan.mapping.em import (
+    Posterior,
+    WeightPrior,
+    diagonal_prior,
+    expand_prior,
+    fit_weights,
+    weight_prior,
+)
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
 from vprism_plan.mapping.hinges import lattice_hinges, needed_nodes, surface_hinges
-from vprism_plan.mapping.posterior import VPrismMap
+from vprism_plan.mapping.posterior import VPrismMap, feature_variance
+from vprism_plan.mapping.prior import (
+    FLAT_OCCUPANCY,
+    Prior,
+    PriorField,
+    hidden_depth,
+    object_crops,
+    prior_field,
+)
 from vprism_plan.mapping.training_data import (
     box_centers,
     grid_subsample,
@@ -61,6 +76,7 @@ def fit_map(
     observations: Observation | Sequence[Observation],
     config: MapConfig | None = None,
     seed: int = 0,
+    prior: Prior | str | None = "shape",
 ) -> VPrismMap:
     """Fit a map to one labelled view, or to several views of one scene in one world frame.
 
@@ -68,29 +84,76 @@ def fit_map(
         observations: views with labels; object ids mean the same in all of them.
         config: parameters; the default is calibrated for planning.
         seed: of all sampling. Same views, config and seed: same bits.
+        prior: what is thought of the hidden side: "shape" for the package's own network, None
+            for the paper's flat prior (always that of `MapConfig.paper()`), a `MeshPrior`, or
+            anything that answers like one.
 
     Raises:
         ObservationError: no labels or no objects (see `segment_tabletop`).
         PlaneNotFoundError: no support plane is known and none can be fitted.
         MapError: the objects would need too many hinge points, or the seed is none.
     """
-    return _fit(observations, MapConfig() if config is None else config, seed)
+    return _fit(observations, MapConfig() if config is None else config, seed, prior)
 
 
 def _fit(
     observations: Observation | Sequence[Observation],
     config: MapConfig,
     seed: int,
+    prior: Prior | str | None,
     known: Sequence[str] = (),
 ) -> VPrismMap:
     """`fit_map`; `known` are warnings of an earlier map of some of the views."""
     problem = learning_problem(observations, config, seed)
-    prior = weight_prior(problem.space, config, len(problem.object_ids) + 1)
-    posterior = _learn(problem.space, problem.data, prior, config)
+    views, ids, plane, space = problem.views, problem.object_ids, problem.plane, problem.space
+    guessed = prior is not None and config.prior_hidden_variance is not None
+    weights = _weight_prior(space, config, len(ids) + 1, views if guessed else None)
+    field = None
+    if guessed:
+        field = prior_field(
+            _guessing(prior)(views, ids, plane),
+            object_crops(views, ids, plane),
+            views,
+            lambda points: feature_variance(space, weights, points),
+            FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
+        )
+    posterior = _learn(space, problem.data, weights, config, field, views)
     return VPrismMap(
-        config, problem.object_ids, problem.plane, problem.views, problem.space, posterior, seed,
-        tuple(dict.fromkeys([*known, *problem.warnings])),
+        config, ids, plane, views, space, posterior, seed,
+        tuple(dict.fromkeys([*known, *problem.warnings])), field,
     )  # fmt: skip
+
+
+def _guessing(prior: Prior | str | None) -> Prior:
+    """Return the prior that was asked for."""
+    if isinstance(prior, str):
+        choice("prior", prior, ["shape"], error=MapError)
+        from vprism_plan.mapping.shape_network import ShapePrior
+
+        return ShapePrior()
+    if not callable(prior):
+        raise MapError(
+            f"prior is a {type(prior).__name__}; give 'shape', None, a MeshPrior, or a function "
+            "of (views, object_ids, plane)"
+        )
+    return prior
+
+
+def _weight_prior(
+    space: FeatureSpace, config: MapConfig, classes: int, views: Sequence[Observation] | None
+) -> WeightPrior:
+    """Return the flat prior of the weights, or with views that of a correction to a guess."""
+    flat = weight_prior(space, config, classes)
+    if views is None:
+        return flat
+    # From what is seen to what is hidden, the variance of a logit falls geometrically.
+    start, stop = config.prior_depths
+    hidden = np.clip((hidden_depth(space.hinges, views) - start) / (stop - start), 0.0, 1.0)
+    wide, narrow = config.prior_seen_variance, config.prior_hidden_variance
+    assert narrow is not None
+    logit = wide ** (1.0 - hidden) * narrow**hidden
+    variance = np.append(logit / config.mean_squared_feature_sum, config.bias_variance)
+    return diagonal_prior(space, np.zeros_like(flat.mean), variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +219,7 @@ def _views(observations: Any) -> tuple[Observation, ...]:
     return views
 
 
-def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
+def update_map(old: VPrismMap, observation: Observation, prior: Prior | str | None) -> VPrismMap:
     """See `VPrismMap.update`."""
     if not isinstance(observation, Observation):
         raise ObservationError(f"update got a {type(observation).__name__}; give one Observation")
@@ -167,7 +230,7 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     views = (*old.views, observation)
     if not set(seen) <= set(old.object_ids):
         logger.info("new objects in the view: all %d views are fitted together", len(views))
-        return _fit(views, config, old.seed, old.warnings)
+        return _fit(views, config, old.seed, None if old.prior is None else prior, old.warnings)
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
@@ -177,15 +240,18 @@ def update_map(old: VPrismMap, observation: Observation) -> VPrismMap:
     hinges = np.concatenate([old.space.hinges, added])
     _check_hinge_count(len(hinges), data, config)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
-    prior = expand_prior(old.space, old.posterior, space, config)
+    fresh = _weight_prior(space, config, old.n_classes, None if old.prior is None else views)
+    weights = expand_prior(old.space, old.posterior, space, fresh)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     data = TrainingData(
         data.points, class_of[data.classes], data.lower, data.upper, data.surface,
         data.surface_ids, data.sunk,
     )  # fmt: skip
-    posterior = _learn(space, data, prior, config)
+    posterior = _learn(space, data, weights, config, old.prior, views)
     warnings = tuple(dict.fromkeys([*old.warnings, *found]))
-    return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed, warnings)
+    return VPrismMap(
+        config, old.object_ids, plane, views, space, posterior, old.seed, warnings, old.prior
+    )
 
 
 def training_data(
@@ -295,18 +361,22 @@ def new_hinges(
     return hinges
 
 
-def _learn(space: FeatureSpace, data: TrainingData, prior: Prior, config: MapConfig) -> Posterior:
+def _learn(
+    space: FeatureSpace, data: TrainingData, weights: WeightPrior, config: MapConfig,
+    field: PriorField | None, views: Sequence[Observation],
+) -> Posterior:  # fmt: skip
     features = block_features(space, data.points)
     logger.info(
         "fitting %d points, %d hinge points, %d classes",
-        len(data.points), len(space.hinges), prior.mean.shape[1],
+        len(data.points), len(space.hinges), weights.mean.shape[1],
     )  # fmt: skip
     return fit_weights(
-        space, features, data.classes, prior,
+        space, features, data.classes, weights,
         iterations=config.iterations,
         variational_updates=config.variational_updates,
         relaxation=config.relaxation,
         tolerance=config.tolerance,
+        offset=None if field is None else field.at(data.points, views),
     )  # fmt: skip
 
 

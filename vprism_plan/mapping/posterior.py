@@ -15,9 +15,10 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior
+from vprism_plan.mapping.em import Posterior, WeightPrior
 from vprism_plan.mapping.factors import correlate, dense_class
 from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
+from vprism_plan.mapping.prior import PriorField
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
@@ -40,6 +41,7 @@ class VPrismMap:
         warnings: what was odd about the views: sentences with the remedy.
         posterior: Gaussian posterior of the weights (hinges in `space` order).
         space: sorted hinge points and kernel.
+        prior: what is added to the kernels' logits: a guess of the hidden side, or None.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class VPrismMap:
         posterior: Posterior,
         seed: int,
         warnings: tuple[str, ...] = (),
+        prior: PriorField | None = None,
     ) -> None:
         self.config = config
         self.object_ids = tuple(object_ids)
@@ -61,6 +64,7 @@ class VPrismMap:
         self.posterior = posterior
         self.seed = seed
         self.warnings = tuple(warnings)
+        self.prior = prior
 
     def __repr__(self) -> str:
         return (
@@ -102,6 +106,8 @@ class VPrismMap:
     def unsupported_occupancy(self) -> float:
         """P(occupied) where no hinge reaches, so that only the bias weights act."""
         mean, variance = self._bias_moments()
+        if self.prior is not None:
+            mean[1:] += self.prior.elsewhere
         return float(
             prediction.occupied_probability(
                 torch.from_numpy(mean)[None], torch.from_numpy(variance)[None]
@@ -192,19 +198,20 @@ class VPrismMap:
         return out + self.posterior.mean
 
     # ------------------------------------------------------------------ learning, files
-    def update(self, observation: Observation) -> "VPrismMap":
+    def update(self, observation: Observation, prior: Any = "shape") -> "VPrismMap":
         """Return a new map that has also seen `observation` (labelled, in the same world frame).
 
         The old posterior is the prior; hinge points for ground the old map did not reach
         enter with the configured prior. If the view shows objects the map does not know,
         all views are fitted again together: a posterior cannot score a class it never had.
+        Then `prior` is that of `fit_map`, if this map has one.
 
         Raises:
             ObservationError: the view has no labels or no objects.
         """
         from vprism_plan.mapping.fitting import update_map
 
-        return update_map(self, observation)
+        return update_map(self, observation, prior)
 
     def save(self, path: str | Path) -> None:
         """Write the map, views included, to a safetensors file; complete or not at all."""
@@ -219,29 +226,10 @@ class VPrismMap:
     def _moments(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-        """Return logit mean, variance and kernel mass; threads over blocks of near points."""
-        n = len(points)
-        bias_mean, bias_variance = self._bias_moments()
-        mean = np.empty((n, self.n_classes))
-        variance = np.empty((n, self.n_classes))
-        mean[:], variance[:] = bias_mean, bias_variance
-        support = np.zeros(n)
-        lower, upper = self.space.bounds
-        inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
-        if len(inside) == 0:
-            return mean, variance, support
-        order, block_start = make_blocks(points[inside], block_extent(self.space))
-        order = inside[order]
-        space, posterior = self.space, self.posterior
-
-        def chunk(piece: slice) -> None:
-            kernels.point_moments(
-                points, order, block_start, piece.start, piece.stop, *space.kernel_arguments,
-                space.gamma, space.radius**2, posterior.mean, posterior.covariance,
-                space.row_first, space.base, mean, variance, support,
-            )  # fmt: skip
-
-        run_chunked(chunk, len(block_start) - 1, 64)
+        """Return logit mean, variance and kernel mass."""
+        mean, variance, support = point_moments(self.space, self.posterior, points)
+        if self.prior is not None:
+            mean += self.prior.at(points, self.views)
         return mean, variance, support
 
     def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
@@ -266,14 +254,24 @@ class VPrismMap:
         if not bool(torch.isfinite(points).all()):
             raise MapError("points hold NaN or infinity; every coordinate must be finite (m)")
         if points.device.type != "cpu":
-            return self._dense_moments(points)
+            return self._guessed(points, *self._dense_moments(points))
         if points.requires_grad and torch.is_grad_enabled():
-            return prediction.LogitMoments.apply(
-                points.to(torch.float64), self.space, self.posterior.mean, self.posterior.covariance
+            exact = points.to(torch.float64)
+            moments = prediction.LogitMoments.apply(
+                exact, self.space, self.posterior.mean, self.posterior.covariance
             )
+            return self._guessed(exact, *moments)
         array = np.ascontiguousarray(points.detach().to(torch.float64).numpy())
         mean, variance, support = self._moments(array)
         return torch.from_numpy(mean), torch.from_numpy(variance), torch.from_numpy(support)
+
+    def _guessed(
+        self, points: Tensor, mean: Tensor, variance: Tensor, support: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Add the prior's logits to those of the kernels."""
+        if self.prior is not None:
+            mean = mean + self.prior.logits(points, self.views)
+        return mean, variance, support
 
     def _dense_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Evaluate on the points' own device with plain torch (float64 where it has that)."""
@@ -318,3 +316,40 @@ def _checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
             f"points[{row}] is {array[row].tolist()}; every coordinate must be finite (m)"
         )
     return array
+
+
+def feature_variance(
+    space: FeatureSpace, weights: WeightPrior, points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, " n"]:
+    """Return the variance of a logit difference at points (m) under independent weights."""
+    covariance = np.zeros_like(weights.precision[:, :2])
+    covariance[space.diagonal] = 1.0 / weights.precision[space.diagonal][:, :2]
+    flat = Posterior(weights.mean[:, :2], covariance, covariance, weights.log_determinant[:2], ())
+    variance = point_moments(space, flat, points)[1]
+    return np.asarray(variance.sum(axis=1))
+
+
+def point_moments(
+    space: FeatureSpace, posterior: Posterior, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+    """Return mean and variance of phi . w, and the kernel mass; threads over blocks of points."""
+    n, classes = len(points), posterior.mean.shape[1]
+    mean, variance = np.empty((n, classes)), np.empty((n, classes))
+    mean[:], variance[:] = posterior.mean[-1], posterior.covariance[-1]
+    support = np.zeros(n)
+    lower, upper = space.bounds
+    inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
+    if len(inside) == 0:
+        return mean, variance, support
+    order, block_start = make_blocks(points[inside], block_extent(space))
+    order = inside[order]
+
+    def chunk(piece: slice) -> None:
+        kernels.point_moments(
+            points, order, block_start, piece.start, piece.stop, *space.kernel_arguments,
+            space.gamma, space.radius**2, posterior.mean, posterior.covariance,
+            space.row_first, space.base, mean, variance, support,
+        )  # fmt: skip
+
+    run_chunked(chunk, len(block_start) - 1, 64)
+    return mean, variance, support

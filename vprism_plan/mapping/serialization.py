@@ -26,13 +26,14 @@ from vprism_plan.errors import ConfigError, MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior
 from vprism_plan.mapping.features import FeatureSpace
+from vprism_plan.mapping.prior import SIDE, PriorField
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
 if TYPE_CHECKING:
     from vprism_plan.mapping.posterior import VPrismMap
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _HEADER = "vprism_plan"
 _DIGEST = "sha256"
 _NEEDED_PARTS = ("depth", "labels", "intrinsics")
@@ -53,6 +54,9 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "history": np.array(posterior.history),
         "plane": _plane_row(fitted.plane),
     }
+    prior = fitted.prior
+    if prior is not None:
+        tensors |= {"prior.T_voxel_world": prior.T_voxel_world, "prior.log_odds": prior.log_odds}
     for index, view in enumerate(fitted.views):
         for part in _VIEW_PARTS:
             if getattr(view, part) is not None:
@@ -68,6 +72,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "max_range": [view.max_range for view in fitted.views],
         "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
+        "prior_elsewhere": None if prior is None else float(prior.elsewhere).hex(),
     }
     arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     if not path.parent.is_dir():
@@ -134,7 +139,7 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     """Return the map, if all of its parts fit together."""
     from vprism_plan.mapping.posterior import VPrismMap
 
-    config = MapConfig(**{**meta["config"], "hinge_shift": tuple(meta["config"]["hinge_shift"])})
+    config = MapConfig(**meta["config"])
     space = FeatureSpace(tensors["hinges"], config.gamma, float.fromhex(meta["radius"]))
     posterior = Posterior(
         tensors["mean"],
@@ -157,7 +162,32 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
     if not all(isinstance(text, str) for text in warnings):
         raise MapError("warnings must be sentences")
-    return VPrismMap(config, object_ids, plane, views, space, posterior, meta["seed"], warnings)
+    prior = _prior(tensors, meta["prior_elsewhere"], len(object_ids))
+    return VPrismMap(
+        config, object_ids, plane, views, space, posterior, meta["seed"], warnings, prior
+    )
+
+
+def _prior(
+    tensors: Mapping[str, np.ndarray], elsewhere: str | None, objects: int
+) -> PriorField | None:
+    """Return the prior's field, if the file has one."""
+    if elsewhere is None:
+        return None
+    field = PriorField(
+        tensors["prior.T_voxel_world"], tensors["prior.log_odds"], float.fromhex(elsewhere)
+    )
+    expected = {
+        "T_voxel_world": ((objects, 3, 4), np.float64),
+        "log_odds": ((objects, SIDE, SIDE, SIDE), np.float32),
+    }
+    for name, (shape, dtype) in expected.items():
+        array = getattr(field, name)
+        if array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
+            raise MapError(f"prior.{name} must be finite {np.dtype(dtype)} {shape}")
+    if not math.isfinite(field.elsewhere):
+        raise MapError(f"prior_elsewhere is {field.elsewhere}")
+    return field
 
 
 def _check_hinges(space: FeatureSpace, config: MapConfig, posterior: Posterior) -> None:
@@ -215,7 +245,17 @@ def _views(tensors: Mapping[str, np.ndarray], count: Any, ranges: Any) -> tuple[
         raise MapError(f"views is {count!r}; a map is learned from one at least")
     if not (isinstance(ranges, list) and len(ranges) == count):
         raise MapError(f"max_range is {ranges!r}; it must be a list of one length per view")
-    names = {"hinges", "mean", "covariance", "precision", "log_determinant", "history", "plane"}
+    names = {
+        "prior.T_voxel_world",
+        "prior.log_odds",
+        "hinges",
+        "mean",
+        "covariance",
+        "precision",
+        "log_determinant",
+        "history",
+        "plane",
+    }
     for index in range(count):
         names.update(f"view{index}.{part}" for part in (*_VIEW_PARTS, "plane"))
     stray = sorted(set(tensors) - names)

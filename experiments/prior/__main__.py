@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Make the data of the shape prior, train its network, write the weights.
+
+    python -m experiments.prior [--scenes 1200] [--steps 9000] [--data DIR] [--output FILE]
+
+Examples go to the data folder, scene by scene; started again, it goes on where it stopped.
+"""
+
+import argparse
+import multiprocessing
+import time
+from pathlib import Path
+
+from experiments.prior.data import Examples, data_files, write
+from experiments.prior.training import train
+from vprism_plan.mapping.shape_network import ShapeNetwork
+
+WEIGHTS = Path(__file__).parents[2] / "vprism_plan" / "data" / "shape_prior.safetensors"
+
+
+def save_network(network: ShapeNetwork, path: Path) -> None:
+    """Write the weights, float16."""
+    import torch
+    from safetensors.torch import save_file
+
+    save_file({k: v.to(torch.float16).contiguous() for k, v in network.state_dict().items()}, path)
+
+
+def main() -> int:
+    """Run what the arguments ask for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=int, default=1200)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--data", type=Path, default=Path("build/prior"))
+    parser.add_argument("--steps", type=int, default=9000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--output", type=Path, default=WEIGHTS)
+    chosen = parser.parse_args()
+    held_out, files = data_files(chosen.scenes, chosen.data)
+    chosen.data.mkdir(parents=True, exist_ok=True)
+    makers = multiprocessing.get_context("spawn").Pool(chosen.jobs)
+    making = makers.map_async(write, [*held_out, *files], chunksize=1)
+    while not all(path.exists() for path in held_out):
+        time.sleep(1.0)
+    network = train(
+        files,
+        Examples.merged([Examples.load(path) for path in held_out]),
+        chosen.steps,
+        chosen.seed,
+        chosen.jobs,
+        lambda line: print(line, flush=True),  # noqa: T201
+        lambda found: save_network(found, chosen.data / "latest.safetensors"),
+    )
+    making.get()
+    makers.close()
+    save_network(network, chosen.output)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""What is thought of the hidden side before the map looks: the prior mean of every logit.
+
+The logits of a map with a prior are z(x) = o(x) + phi(x) . w: a guess o, kept on a small grid
+around each object, and V-PRISM's weighted kernels, which correct it. The weights are zero
+before anything is seen, wide where a camera looks and narrow where none does, so that what
+was seen overrules the guess, and what was not leaves it.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.special import ndtr
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from vprism_plan._arguments import number
+from vprism_plan.errors import MapError
+from vprism_plan.perception.camera import invert_transform, project, transform_points
+from vprism_plan.perception.observation import Observation
+from vprism_plan.perception.plane import Plane
+
+SIDE = 32  # voxels
+_FINEST = 0.0075  # metres of a voxel, at least
+_ACROSS = 20.0  # voxels that the seen part of an object spans, at most
+_BEHIND = 3.0  # voxels by which the crop lies behind the middle of what was seen
+_BELOW, _ABOVE = 2.0, 3.0  # voxels under the support surface, and of room above the object
+_SEEN = 0.01  # metres in front of what was seen, where nothing is
+MOST = 8.0  # log-odds: no guess is surer than 0.9997
+FLAT_OCCUPANCY = 0.2  # P(occupied) where nobody guesses
+
+
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """A cube of `SIDE` voxels around one object.
+
+    Attributes:
+        T_world_crop: crop to world; its origin is the cube's lowest corner.
+        voxel: edge of a voxel, m.
+        floor: height of the cube's lowest corner above the support surface, m.
+    """
+
+    T_world_crop: Float[np.ndarray, "4 4"]
+    voxel: float
+    floor: float
+
+    @classmethod
+    def around(
+        cls, points: Float[np.ndarray, "n 3"], camera: Float[np.ndarray, " 3"], plane: Plane,
+        zoom: float = 1.0,
+    ) -> "Crop":  # fmt: skip
+        """Return the crop of an object whose seen points (m, world) these are.
+
+        Args:
+            points: at least one.
+            camera: optical centre of the view that shows the object best, m, world.
+            plane: support surface.
+            zoom: factor of the voxel's usual edge.
+        """
+        up = plane.normal
+        low, high = np.quantile(points, [0.02, 0.98], axis=0)
+        ahead = 0.5 * (low + high) - camera
+        ahead = ahead - (ahead @ up) * up
+        length = float(np.linalg.norm(ahead))
+        ahead = ahead / length if length > 1e-6 else plane.axes()[0]
+        rotation = np.stack([ahead, np.cross(up, ahead), up], axis=1)
+        low, high = np.quantile(points @ rotation, [0.02, 0.98], axis=0)
+        voxel = zoom * max(_FINEST, float((high - low).max()) / _ACROSS)
+        # What stands on others, or lies lower than the surface, moves the crop up or down.
+        floor = -_BELOW * voxel
+        floor = max(floor, high[2] - plane.offset - (SIDE - _ABOVE) * voxel)
+        floor = min(floor, low[2] - plane.offset - _BELOW * voxel)
+        middle = 0.5 * (low + high)[:2] + [_BEHIND * voxel, 0.0]
+        corner = np.array([*(middle - 0.5 * SIDE * voxel), floor + plane.offset])
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, rotation @ corner
+        return cls(pose, voxel, floor)
+
+    def centers(self) -> Float[np.ndarray, "n 3"]:
+        """Return the voxels' centres, m, world; z runs fastest."""
+        axis = (np.arange(SIDE) + 0.5) * self.voxel
+        grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        return transform_points(self.T_world_crop, grid)
+
+    def T_voxel_world(self) -> Float[np.ndarray, "3 4"]:  # noqa: N802
+        """Return the map from world points (m) to voxels, whose centres are at whole numbers."""
+        inverse = invert_transform(self.T_world_crop)[:3] / self.voxel
+        inverse[:, 3] -= 0.5
+        return inverse
+
+    def to_voxels(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return where world points (m) lie, counted in voxels; centres are at whole numbers."""
+        pose = self.T_voxel_world()
+        return points @ pose[:, :3].T + pose[:, 3]
+
+
+class Guess(Protocol):
+    """What some prior thinks of one scene."""
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
+        """Return P(class) at points (m, world): "empty" first, then the objects; rows sum to 1."""
+
+
+class Prior(Protocol):
+    """Anything that guesses what objects look like where no camera looked."""
+
+    def __call__(
+        self, views: Sequence[Observation], object_ids: tuple[int, ...], plane: Plane
+    ) -> Guess:
+        """Return the guess for labelled views of some objects on a support surface."""
+
+
+class MeshPrior:
+    """Hypotheses of objects' shapes: from a mesh library, a generative model, a CAD file.
+
+    Args:
+        hypotheses: object id -> pairs of a closed `trimesh.Trimesh` in the world frame (m) and
+            a weight. Weights of an object sum to at most 1; what they lack is the flat prior's.
+        blur: how far (m) an observed surface may lie from a hypothesis's, one standard
+            deviation.
+
+    Raises:
+        MapError: a mesh that is not closed, a weight that is no share, or a blur of 0.
+    """
+
+    def __init__(
+        self, hypotheses: Mapping[int, Sequence[tuple[Any, float]]], blur: float = 0.005
+    ) -> None:
+        for object_id, pairs in hypotheses.items():
+            for mesh, weight in pairs:
+                number(f"weight of a mesh of object {object_id}", weight, 0.0, 1.0, error=MapError)
+                if not mesh.is_watertight:
+                    raise MapError(
+                        f"a mesh of object {object_id} is not closed; close it (trimesh's "
+                        "fill_holes) or give its convex hull"
+                    )
+            total = sum(weight for _, weight in pairs)
+            number(f"sum of the weights of object {object_id}", total, 0.0, 1.0 + 1e-9,
+                   error=MapError)  # fmt: skip
+        self._hypotheses = dict(hypotheses)
+        self._blur = number("blur", blur, 0.0, unit="metres", above=True, error=MapError)
+
+    def __call__(
+        self, views: Sequence[Observation], object_ids: tuple[int, ...], plane: Plane
+    ) -> Guess:
+        """Return the guess; ids that have no hypothesis keep the flat prior.
+
+        Raises:
+            MapError: a hypothesis for an object that no view shows.
+        """
+        strange = sorted(set(self._hypotheses) - set(object_ids))
+        if strange:
+            raise MapError(f"the prior has objects {strange}; the views show {list(object_ids)}")
+
+        def guess(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
+            own = np.empty((len(points), len(object_ids)))
+            for column, object_id in enumerate(object_ids):
+                pairs = self._hypotheses.get(object_id, ())
+                rest = 1.0 - sum(weight for _, weight in pairs)
+                own[:, column] = rest * FLAT_OCCUPANCY / len(object_ids)
+                for mesh, weight in pairs:
+                    own[:, column] += weight * self._held(mesh, points)
+            return with_empty(own)
+
+        return guess
+
+    def _held(self, mesh: Any, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """P(inside) of points, the surface moved by a normal error of `blur`."""
+        spacing = 0.5 * self._blur
+        surface, _ = mesh.sample(int(mesh.area / spacing**2) + 100, return_index=True, seed=0)
+        low, high = mesh.bounds
+        reach = 4.0 * self._blur
+        near = np.flatnonzero(((points > low - reach) & (points < high + reach)).all(axis=1))
+        distance, _ = cKDTree(surface).query(points[near])
+        held = np.zeros(len(points))
+        held[near] = ndtr(np.where(mesh.contains(points[near]), distance, -distance) / self._blur)
+        return held
+
+
+@dataclass(frozen=True, eq=False)
+class PriorField:
+    """Prior mean of the objects' logits, that of "empty" being 0.
+
+    Attributes:
+        T_voxel_world: (C, 3, 4) world (m) to voxels of each object's grid.
+        log_odds: (C, n, n, n) float32, at the voxels' centres.
+        elsewhere: log-odds of every object where no grid reaches and no view looked.
+    """
+
+    T_voxel_world: Float[np.ndarray, "c 3 4"]
+    log_odds: Float[np.ndarray, "c n n n"]
+    elsewhere: float
+
+    def logits(
+        self, points: Float[Tensor, "n 3"], views: Sequence[Observation]
+    ) -> Float[Tensor, "n k"]:
+        """Return the prior means of all logits at points (m), differentiable, on their device.
+
+        Where no grid reaches, what the views saw through is empty.
+        """
+        pose = torch.as_tensor(self.T_voxel_world).to(points)
+        grids = torch.as_tensor(self.log_odds).to(points)
+        last = self.log_odds.shape[1] - 1
+        # (C, N, 3), whole numbers are centres; summed term by term, so that a point's bits do
+        # not depend on its company.
+        at = pose[:, None, :, 3]
+        for axis in range(3):
+            at = at + points[:, axis, None] * pose[:, None, :, axis]
+        inside = ((at >= 0.0) & (at <= last)).all(dim=2)
+        columns = [torch.zeros_like(points[:, 0])]
+        somewhere = inside.any(dim=0)
+        outside = torch.full_like(points[:, 0], -MOST)
+        unguessed = (~somewhere).nonzero()[:, 0]
+        if len(unguessed):
+            behind = hidden_depth(points.detach()[unguessed].cpu().numpy(), views)
+            unseen = torch.from_numpy(behind > -_SEEN).to(unguessed.device)
+            outside[unguessed[unseen]] = self.elsewhere
+        for grid, place, own in zip(grids, at, inside, strict=True):
+            rows = own.nonzero()[:, 0]
+            # grid_sample wants the last axis first, scaled to [-1, 1].
+            scaled = (place[rows] * (2.0 / last) - 1.0).flip(1)[None, :, None, None]
+            value = grid_sample(grid[None, None], scaled, align_corners=True)
+            columns.append(outside.index_put((rows,), value.reshape(-1)))
+        return torch.stack(columns, dim=1)
+
+    def at(
+        self, points: Float[np.ndarray, "n 3"], views: Sequence[Observation]
+    ) -> Float[np.ndarray, "n k"]:
+        """Return the same for numpy points, float64."""
+        with torch.no_grad():
+            return self.logits(torch.from_numpy(np.ascontiguousarray(points)), views).numpy()
+
+
+def with_empty(own: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n k"]:
+    """Return P(class) of P(object): objects that contradict each other share what there is."""
+    together = own.sum(axis=1)
+    own = own * np.minimum(1.0, (1.0 - 1e-6) / np.maximum(together, 1e-12))[:, None]
+    return np.column_stack([1.0 - own.sum(axis=1), own])
+
+
+def elsewhere(occupancy: float, objects: int) -> float:
+    """Log-odds of each of some objects that together say P(occupied) = `occupancy`."""
+    return math.log(occupancy / (1.0 - occupancy) / objects)
+
+
+def object_crops(
+    views: Sequence[Observation], object_ids: tuple[int, ...], plane: Plane
+) -> tuple[Crop, ...]:
+    """Return the crop of every object, seen from the view that shows most of it."""
+    clouds = [view.points() for view in views]
+    crops = []
+    for k in object_ids:
+        own = [points[labels == k] for points, labels in clouds]
+        best = int(np.argmax([len(points) for points in own]))
+        crops.append(Crop.around(np.concatenate(own), views[best].camera_center, plane))
+    return tuple(crops)
+
+
+def hidden_depth(
+    points: Float[np.ndarray, "n 3"], views: Sequence[Observation]
+) -> Float[np.ndarray, " n"]:
+    """Return how far (m) points lie behind what the views saw, negative in front of it.
+
+    Of several views the one that sees farthest counts. What no view shows, or only pixels
+    without a return, is infinitely far behind.
+    """
+    behind = np.full(len(points), np.inf)
+    for view in views:
+        local = transform_points(invert_transform(view.pose), points)
+        pixels, z = project(local, view.intrinsics)
+        height, width = view.depth.shape
+        with np.errstate(invalid="ignore"):
+            column, row = np.rint(pixels).T
+            inside = (z > 0.0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        depth = np.zeros(len(points))
+        depth[inside] = view.depth[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+        known = depth > 0.0
+        behind[known] = np.minimum(behind[known], (z - depth)[known])
+    return behind
+
+
+def prior_field(
+    guess: Guess,
+    crops: Sequence[Crop],
+    views: Sequence[Observation],
+    spread: Callable[[Any], Any],
+    occupancy: float,
+) -> PriorField:
+    """Put a guess onto the objects' grids; where the views saw through, nothing is.
+
+    Args:
+        guess: the prior's.
+        crops: one per object.
+        views: that it guessed from.
+        spread: points (n, 3) m -> (n,) prior variance of a difference of two logits there.
+            Log-odds grow with it, so that a map that has seen nothing predicts the guess
+            (section III of the paper shrinks them by as much).
+        occupancy: P(occupied) where no grid reaches.
+    """
+    grids = []
+    half = SIDE // 2
+    for index, crop in enumerate(crops):
+        points = crop.centers()
+        proba = guess(points)
+        tiny = math.exp(-MOST)
+        proba[hidden_depth(points, views) < -_SEEN, 1:] = 0.0
+        odds = np.log(np.maximum(proba[:, index + 1], tiny) / np.maximum(proba[:, 0], tiny))
+        # Variances change over a kernel's length, some voxels: every other one is enough.
+        coarse = points.reshape(SIDE, SIDE, SIDE, 3)[::2, ::2, ::2].reshape(-1, 3)
+        factor = np.sqrt(1.0 + 0.125 * math.pi * spread(coarse)).reshape(half, half, half)
+        for axis in range(3):
+            factor = factor.repeat(2, axis=axis)
+        grid = np.clip(odds, -MOST, MOST).reshape(SIDE, SIDE, SIDE) * factor
+        grids.append(grid.astype(np.float32))
+    poses = np.stack([crop.T_voxel_world() for crop in crops])
+    return PriorField(poses, np.stack(grids), elsewhere(occupancy, len(crops)))
