@@ -35,7 +35,7 @@ from experiments.baselines.pointsdf.training import (
 from experiments.baselines.pointsdf.weights import SHIPPED, save_network
 from experiments.protocols import TrueScene
 from vprism_plan._files import write_text
-from vprism_plan.simulation.placement import random_camera
+from vprism_plan.simulation.scenes import random_camera
 
 ROOT = Path(__file__).resolve().parents[2]
 VERSION = 1  # of the examples; raised by hand when generator or sampling change their meaning

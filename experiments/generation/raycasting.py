@@ -7,8 +7,7 @@ import numpy as np
 
 from vprism_plan.errors import MissingDependencyError
 from vprism_plan.perception.observation import Observation
-from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.imaging import sense, table_depth
+from vprism_plan.simulation.camera import Camera, DepthNoise, sense, table_depth
 
 if TYPE_CHECKING:
     import trimesh

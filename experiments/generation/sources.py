@@ -27,7 +27,7 @@ from experiments.generation.shapes import (
     shape_of,
 )
 from vprism_plan.errors import ConfigError, MissingDependencyError
-from vprism_plan.simulation.placement import random_solid
+from vprism_plan.simulation.scenes import random_solid
 
 SETS = ("analytic", "ycb", "random")  # the sets of the tables
 KINDS = (*SETS, "random-train", "folder")

@@ -21,8 +21,7 @@ _FORMAT = "vprism_plan scene, version 1"
 GROUND_TRUTH = "ground_truth.json"
 
 
-def scene_to_dict(scene: Scene) -> dict[str, Any]:
-    """Return everything that defines a scene, JSON-ready and exact."""
+def _to_dict(scene: Scene) -> dict[str, Any]:
     return {
         "format": _FORMAT,
         "name": scene.name,
@@ -30,17 +29,14 @@ def scene_to_dict(scene: Scene) -> dict[str, Any]:
         "labels": list(scene.labels),
         "solids": [solid.to_dict() for solid in scene.solids],
         "camera": {
-            "T_world_camera": scene.camera.T_world_camera.tolist(),
-            "intrinsics": scene.camera.intrinsics.tolist(),
-            "width": scene.camera.width,
-            "height": scene.camera.height,
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(scene.camera).items()
         },
         "noise": None if scene.noise is None else asdict(scene.noise),
     }
 
 
-def scene_from_dict(data: dict[str, Any]) -> Scene:
-    """Rebuild a scene; raises ObservationError for another format."""
+def _from_dict(data: dict[str, Any]) -> Scene:
     if data.get("format") != _FORMAT:
         raise ObservationError(
             f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
@@ -49,12 +45,7 @@ def scene_from_dict(data: dict[str, Any]) -> Scene:
     return Scene(
         tuple(solid_from_dict(solid) for solid in data["solids"]),
         tuple(data["labels"]),
-        Camera(
-            np.asarray(camera["T_world_camera"], dtype=np.float64),
-            np.asarray(camera["intrinsics"], dtype=np.float64),
-            camera["width"],
-            camera["height"],
-        ),
+        Camera(**{k: np.array(v, float) if isinstance(v, list) else v for k, v in camera.items()}),
         None if data["noise"] is None else DepthNoise(**data["noise"]),
         data["seed"],
         data["name"],
@@ -72,7 +63,7 @@ def save_scene(scene: Scene, path: str | Path) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_observation(scene.observation, path)
-    write_text(_truth_path(path), json.dumps(scene_to_dict(scene), indent=1) + "\n")
+    write_text(_truth_path(path), json.dumps(_to_dict(scene), indent=1) + "\n")
 
 
 def load_ground_truth(path: str | Path) -> Scene:
@@ -81,7 +72,7 @@ def load_ground_truth(path: str | Path) -> Scene:
     if not truth.is_file():
         raise ObservationError(f"{truth} does not exist; a scene is written by save_scene")
     with reading(truth, "the truth of a scene", ObservationError):
-        return scene_from_dict(read_json(truth, ObservationError))
+        return _from_dict(read_json(truth, ObservationError))
 
 
 def _truth_path(path: Path) -> Path:
