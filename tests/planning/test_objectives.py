@@ -227,7 +227,7 @@ def test_planners_that_would_ignore_an_objective_refuse_it(planner):
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    ({"kind": "fear"}, "'fear'.*survival, joint"),
+    ({"kind": "fear"}, "'fear'.*'survival', 'joint'"),
     ({"length_weight": -1.0}, "length_weight is -1"),
     ({"length_weight": np.nan}, "length_weight is nan"),
 ])  # fmt: skip

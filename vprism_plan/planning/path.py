@@ -53,16 +53,18 @@ class MotionCheck:
         self.count += 1
         if np.any(np.abs(qb - qa)[self._turns] >= np.pi):
             return False
-        if outside_limits(self._robot, np.stack([qa, qb])).any():
+        if outside_limits(self._robot, np.stack([qa, qb]), _ROUNDING).any():
             return False
         return bool(self._check(qa, qb))
 
 
-def outside_limits(robot: Any, path: Waypoints) -> Bool[np.ndarray, " t"]:
-    """Return which rows have a limited joint outside its limits by more than rounding."""
-    low = path < np.asarray(robot.lower) - _ROUNDING
-    high = path > np.asarray(robot.upper) + _ROUNDING
-    return np.asarray(np.any((low | high) & ~np.asarray(robot.continuous, dtype=bool), axis=1))
+def outside_limits(
+    robot: Any, q: Float[np.ndarray, "... dof"], slack: float = 0.0
+) -> Bool[np.ndarray, "... dof"]:
+    """Return which values are beyond the limits of their joints by more than `slack`."""
+    low = q < np.asarray(robot.lower) - slack
+    high = q > np.asarray(robot.upper) + slack
+    return np.asarray((low | high) & ~np.asarray(robot.continuous, dtype=bool))
 
 
 def shorten(
@@ -237,7 +239,7 @@ def verified(
 ) -> PlanResult:
     """Check every edge of the final waypoints again, and measure the path."""
     began = now()
-    outside = outside_limits(checker.robot, path)
+    outside = outside_limits(checker.robot, path, _ROUNDING)
     verdicts: list[Any] = []
     for edge, (a, b) in enumerate(pairwise(path)):
         verdicts.append(checker.check_motion_report(a, b))

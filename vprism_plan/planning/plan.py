@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vprism_plan._arguments import is_number
+from vprism_plan._arguments import number
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.attempts import Query, attempt, within_risk
 from vprism_plan.planning.goals import (
@@ -24,7 +24,7 @@ from vprism_plan.planning.path import one_line
 from vprism_plan.planning.planners import planner_kind, planners
 from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, SecondOpinion
 from vprism_plan.planning.result import PlanReport, PlanResult
-from vprism_plan.planning.search import SearchRequest, clock_named
+from vprism_plan.planning.search import CLOCKS, SearchRequest
 
 _log = logging.getLogger(__name__)
 
@@ -115,14 +115,13 @@ def plan(
         PlanningError: for a malformed query, naming the value and the valid ones.
     """
     request = SearchRequest(planner, time_limit, seed, stop, convergence, step, clock)
-    for name, value in (("interpolate", interpolate), ("clearance_step", clearance_step)):
-        if value is not None and not (is_number(value) and value > 0.0):
-            raise PlanningError(f"{name} is {value!r}; it must be more than 0")
-    if not (is_number(simplify_time) and simplify_time >= 0.0):
-        raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
+    for name, length in (("interpolate", interpolate), ("clearance_step", clearance_step)):
+        if length is not None or name == "clearance_step":
+            number(name, length, 0.0, above=True, finite=False, error=PlanningError)
+    number("simplify_time", simplify_time, 0.0, unit="s", finite=False, error=PlanningError)
     _refuse_unfit(second_opinion, checker)
     q_start = configuration(start, checker.robot, "start")
-    now = clock_named(clock)
+    now = CLOCKS[clock]
 
     def answer(judge: CheckerLike, limit: float) -> PlanResult:
         asked = replace(request, time_limit=limit)

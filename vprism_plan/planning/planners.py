@@ -11,6 +11,7 @@ from jaxtyping import Float
 from ompl import base as ob
 from ompl import geometric as og
 
+from vprism_plan._arguments import choice
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.ompl_adapter import StateReader, nearest_turns, write_state
 from vprism_plan.planning.protocols import Configuration, Waypoints
@@ -84,9 +85,7 @@ def planners() -> dict[str, PlannerKind]:
 
 def planner_kind(name: str) -> PlannerKind:
     """Look a planner up; raise PlanningError listing the valid names."""
-    if name not in PLANNERS:
-        raise PlanningError(f"unknown planner {name!r}; valid planners are {', '.join(PLANNERS)}")
-    return PLANNERS[name]
+    return PLANNERS[choice("planner", name, PLANNERS, error=PlanningError)]
 
 
 def make_planner(kind: PlannerKind, si: Any, step: float | None) -> Any:

@@ -2,8 +2,7 @@
 """One search with OMPL: numpy in, numpy out.
 
 Every OMPL object lives and dies inside `search`; nothing of it outlives the call, so
-nothing can leak and no planner is ever used twice. What is global to the process, the log
-and the seed of the generators, is set here as well.
+nothing can leak and no planner is ever used twice.
 """
 
 import math
@@ -19,7 +18,7 @@ from jaxtyping import Float
 from ompl import base as ob
 from ompl import util as ou
 
-from vprism_plan._arguments import is_number, is_whole
+from vprism_plan._arguments import choice, number, whole
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.objectives import PathCost, make_objective
 from vprism_plan.planning.ompl_adapter import (
@@ -46,7 +45,7 @@ MAX_SEED = 2**32 - 2
 # while it waits for goals, which spends none. A machine that busy would be no help anyway.
 PATIENCE = 50.0
 # Processor time is that of the whole process, worker threads included.
-_CLOCKS: dict[str, Now] = {"wall": time.perf_counter, "process": time.process_time}
+CLOCKS: dict[str, Now] = {"wall": time.perf_counter, "process": time.process_time}
 _GOAL_TOLERANCE = 1e-9
 _NOTICEABLE = 0.02  # relative fall of the cost that is worth a look at the path
 
@@ -65,7 +64,7 @@ class SearchRequest:
 
     def __post_init__(self) -> None:
         kind = planner_kind(self.planner)
-        clock_named(self.clock)
+        choice("clock", self.clock, CLOCKS, error=PlanningError)
         if kind.starts_thread and self.clock != "wall":
             raise PlanningError(
                 f"clock is {self.clock!r} with {self.planner}: its second thread would wait for "
@@ -75,26 +74,22 @@ class SearchRequest:
             raise PlanningError(
                 f"{self.planner} does not say what its path costs; use stop='limit'"
             )
-        limit, step = self.time_limit, self.step
-        if not (is_number(limit) and math.isfinite(limit) and limit > 0):
-            raise PlanningError(f"time_limit is {limit!r} s; it must be finite and more than 0")
-        if self.stop not in ("limit", "first", "converged"):
-            raise PlanningError(
-                f"stop is {self.stop!r}; valid values are 'limit', 'first', 'converged'"
-            )
+        set_ = object.__setattr__
+        limit = number(
+            "time_limit", self.time_limit, 0.0, unit="s", above=True, error=PlanningError
+        )
+        set_(self, "time_limit", limit)
+        choice("stop", self.stop, ("limit", "first", "converged"), error=PlanningError)
         tolerance, patience = self.convergence
         if not (0.0 < tolerance < 1.0 and patience >= 1):
             raise PlanningError(
                 f"convergence is {self.convergence!r}; it must be (tolerance in (0, 1), patience "
                 "of at least 1 iteration)"
             )
-        if step is not None and not (is_number(step) and math.isfinite(step) and step > 0.0):
-            raise PlanningError(f"step is {step!r}; it must be finite and more than 0, or None")
-        set_ = object.__setattr__
-        set_(self, "time_limit", float(limit))
-        set_(self, "seed", checked_seed(self.seed))
         set_(self, "convergence", (float(tolerance), int(patience)))
-        set_(self, "step", None if step is None else float(step))
+        if self.step is not None:
+            set_(self, "step", number("step", self.step, 0.0, above=True, error=PlanningError))
+        set_(self, "seed", checked_seed(self.seed))
 
 
 @dataclass(frozen=True)
@@ -131,7 +126,7 @@ def search(
         space = state_space(checker.robot)
         si = ob.SpaceInformation(space)
         held = _HeldErrors(checker) if kind.starts_thread else None
-        judge: CheckerLike = checker if held is None else held
+        judge: Any = held or checker
         states = VPrismStateValidityChecker(si, judge)
         motions = VPrismMotionValidator(si, judge)
         si.setStateValidityChecker(states)
@@ -157,7 +152,7 @@ def search(
         planner.setup()
 
         reader = StateReader(space, len(start))
-        now = clock_named(request.clock)
+        now = CLOCKS[request.clock]
         began = now()
         if held is None:
             status, history = _solve(planner, problem, reader, start, request, guided)
@@ -169,13 +164,17 @@ def search(
         path, goal_index = None, None
         if problem.hasSolution():
             solution = problem.getSolutionPath()
-            goal_index = _reached(reader, solution, goals)
+            last = reader.read(solution.getState(solution.getStateCount() - 1))
+            away = np.abs(nearest_turns(goals, last, reader.wraps) - last).max(axis=1)
+            nearest = int(np.argmin(away))
+            goal_index = nearest if away[nearest] <= _GOAL_TOLERANCE else None
             claimed = status == ob.PlannerStatus.EXACT_SOLUTION and problem.hasExactSolution()
             # OMPL calls approximate solutions "solved"; the last state decides.
             verdict = "exact" if claimed and goal_index is not None else "approximate"
             path = _waypoints(reader, solution, start)
-        took, asked = planned - began, (states.checks, motions.checks)
-        return SearchOutcome(verdict, path, goal_index, took, *asked, history)
+        return SearchOutcome(
+            verdict, path, goal_index, planned - began, states.checks, motions.checks, history
+        )
 
 
 def _set_objective(
@@ -208,7 +207,7 @@ def _solve(
 ) -> tuple[Any, tuple[Improvement, ...]]:
     """Run the planner until it is done or has to stop; note every better path on the way."""
     kind = planner_kind(request.planner)
-    now = clock_named(request.clock)
+    now = CLOCKS[request.clock]
     began = now()
     end = began + request.time_limit
     if not (kind.optimising and kind.reports_cost):
@@ -279,13 +278,6 @@ class _Progress:
         return self.settled
 
 
-def _reached(reader: StateReader, solution: Any, goals: Float[np.ndarray, "g dof"]) -> int | None:
-    last = reader.read(solution.getState(solution.getStateCount() - 1))
-    worst = np.max(np.abs(nearest_turns(goals, last, reader.wraps) - last), axis=1)
-    best = int(np.argmin(worst))
-    return best if worst[best] <= _GOAL_TOLERANCE else None
-
-
 def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoints:
     """Copy a path to numpy, wrapping coordinates continued from row to row, from the start's
     own turns on."""
@@ -304,9 +296,7 @@ class _HeldErrors:
     """
 
     def __init__(self, checker: CheckerLike) -> None:
-        self.robot, self.clearance, self.explain = checker.robot, checker.clearance, checker.explain
-        self.is_valid, self.check_motion = checker.is_valid, checker.check_motion
-        self.check_motion_report = checker.check_motion_report
+        self.robot, self.clearance = checker.robot, checker.clearance
         self._checker = checker
         self._stop: Callable[[], None] | None = None
         self._error: BaseException | None = None
@@ -342,16 +332,6 @@ class _HeldErrors:
         return status
 
 
-def clock_named(name: str) -> Now:
-    """Return the function that reads a clock, seconds; raise PlanningError for an unknown name."""
-    if name not in _CLOCKS:
-        raise PlanningError(
-            f"clock is {name!r}; valid values are 'wall' (time that passes) and 'process' "
-            "(processor time of this process, which other load does not inflate)"
-        )
-    return _CLOCKS[name]
-
-
 def time_is_up(name: str, seconds: float) -> Any:
     """Return an OMPL termination condition that holds `seconds` from now on a clock.
 
@@ -360,7 +340,7 @@ def time_is_up(name: str, seconds: float) -> Any:
     if name == "wall":
         # The form without an interval reads the clock itself: no extra thread, no overshoot.
         return ob.timedPlannerTerminationCondition(seconds)
-    now = clock_named(name)
+    now = CLOCKS[name]
     end = now() + seconds
     asleep = time.perf_counter() + PATIENCE * seconds
     return ob.PlannerTerminationCondition(lambda: now() >= end or time.perf_counter() >= asleep)
@@ -394,7 +374,5 @@ def quiet_ompl() -> Iterator[None]:
 
 
 def checked_seed(seed: Any) -> int:
-    """Return the seed as an int; raise PlanningError unless it is an integer from 0."""
-    if not is_whole(seed) or not 0 <= seed <= MAX_SEED:
-        raise PlanningError(f"seed is {seed!r}; it must be an integer from 0 to {MAX_SEED}")
-    return int(seed)
+    """Return the seed as an int; raise PlanningError unless it is one from 0 to `MAX_SEED`."""
+    return whole("seed", seed, 0, MAX_SEED, error=PlanningError)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from vprism_plan._arguments import is_whole
+from vprism_plan._arguments import is_whole, number
 from vprism_plan._files import read_json, reading, write_text
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.protocols import Configuration
@@ -100,8 +100,7 @@ def time_parameterize(
         raise PlanningError(f"path has shape {path.shape}; {needed}")
     if not np.isfinite(path).all():
         raise PlanningError("the path holds NaN or infinite values")
-    if not 0.0 < scale <= 1.0:
-        raise PlanningError(f"scale is {scale!r}; it must be more than 0 and at most 1")
+    number("scale", scale, 0.0, 1.0, above=True, error=PlanningError)
     given = robot.velocity_limits if velocity_limits is None else velocity_limits
     speed = _limits("velocity", given, names)
     push = speed / _SECONDS_TO_FULL_SPEED
@@ -123,11 +122,9 @@ def _limits(kind: str, values: ArrayLike, names: tuple[str, ...]) -> Configurati
             f"{kind} limits have shape {limits.shape}; one per joint is needed: {', '.join(names)}"
         )
     for name, limit in zip(names, limits, strict=True):
-        if not (math.isfinite(limit) and limit > 0.0):
-            raise PlanningError(
-                f"{kind} limit of joint {name!r} is {limit}; it must be finite and more than 0 "
-                f"(pass {kind}_limits if the robot's description has none)"
-            )
+        hint = f"(pass {kind}_limits if the robot's description has none)"
+        what = f"{kind} limit of joint {name!r}"
+        number(what, float(limit), 0.0, unit=hint, above=True, error=PlanningError)
     return limits
 
 
