@@ -25,13 +25,7 @@ import numpy as np
 
 from experiments.baselines.pointsdf.data import Examples, examples_of
 from experiments.baselines.pointsdf.shapes import training_scene
-from experiments.baselines.pointsdf.training import (
-    LEVELS,
-    Look,
-    Schedule,
-    mean_iou,
-    train,
-)
+from experiments.baselines.pointsdf.training import LEVELS, Look, Schedule, mean_iou, train
 from experiments.baselines.pointsdf.weights import SHIPPED, save_network
 from experiments.protocols import TrueScene
 from vprism_plan._files import write_text

@@ -20,12 +20,7 @@ from typing import Protocol
 
 import numpy as np
 
-from experiments.generation.shapes import (
-    MESH_SUFFIXES,
-    Shape,
-    read_shape,
-    shape_of,
-)
+from experiments.generation.shapes import MESH_SUFFIXES, Shape, read_shape, shape_of
 from vprism_plan.errors import ConfigError, MissingDependencyError
 from vprism_plan.simulation.scenes import random_solid
 

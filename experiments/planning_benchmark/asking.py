@@ -14,12 +14,7 @@ from jaxtyping import Float
 from experiments.planning_benchmark.checkers import Bench
 from experiments.planning_benchmark.contenders import Contender
 from experiments.planning_benchmark.grid_world import benchmark_robot, views_of
-from experiments.planning_benchmark.problems import (
-    Criteria,
-    Problem,
-    find_problems,
-    tip_sphere,
-)
+from experiments.planning_benchmark.problems import Criteria, Problem, find_problems, tip_sphere
 from experiments.planning_benchmark.truth import PathTruth, Truth
 from experiments.protocols import TrueScene
 from experiments.tables.scoring import commit

@@ -155,9 +155,7 @@ class Bench:
             )  # fmt: skip
         return world_of_lattice(lattice, grid, names, self.observation)
 
-    def _things(
-        self,
-    ) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, Float[np.ndarray, " n"]]:
+    def _things(self) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, Float[np.ndarray, " n"]]:
         """Points (m) off the table, their labels and depths (m); flying pixels left out."""
         view = self.observation
         points, labels = view.points()

@@ -12,12 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.planning_benchmark.asking import (
-    Answer,
-    Limits,
-    answer_case,
-    problem_case,
-)
+from experiments.planning_benchmark.asking import Answer, Limits, answer_case, problem_case
 from experiments.planning_benchmark.contenders import contenders, settings
 from experiments.planning_benchmark.problems import Criteria
 from experiments.tables import scoring

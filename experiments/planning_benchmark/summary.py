@@ -256,10 +256,7 @@ def statements(found: Sequence[Outcome]) -> list[Statement]:
     """Compare our curve with meshes at their success (with wide steps and with fine ones), and
     with unknown occupied at its collisions."""
     ours = [outcome for outcome in found if outcome.contender.key.startswith(OURS)]
-    groups = {
-        "ours": ours,
-        "ours with one rule": [o for o in ours if len(o.contender.bounds) == 1],
-    }
+    groups = {"ours": ours, "ours with one rule": [o for o in ours if len(o.contender.bounds) == 1]}
     by_key = {outcome.contender.key: outcome for outcome in found}
     made = []
     for key, asked in (

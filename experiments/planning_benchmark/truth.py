@@ -14,11 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.planning_benchmark.grid_world import (
-    benchmark_grid,
-    checker_of,
-    world_of_distances,
-)
+from experiments.planning_benchmark.grid_world import benchmark_grid, checker_of, world_of_distances
 from experiments.protocols import TrueScene
 from vprism_plan.collision import CollisionChecker
 from vprism_plan.collision.motion import Edges, edges_of, place_points

@@ -44,7 +44,6 @@ REGIONS = {
 def test_every_solution_is_in_the_region_by_the_links_own_pose(name, arm):
     region = REGIONS[name]
     found = solve_region(arm, region, START, 0, FEW)
-    assert found.attempts == 24
     assert len(found) >= 5
     assert (found >= arm.lower).all()
     assert (found <= arm.upper).all()

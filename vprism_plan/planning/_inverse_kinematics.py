@@ -72,20 +72,17 @@ def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
             f"{robot.name} has no link {name!r}; its links are {', '.join(links[0])}"
         )
     for frame in reversed(range(len(parent))):
-        offsets = [_rigid_inverse(R[i, frame], t[i, frame]) @ links[i][name] for i in (0, 1)]
+        inverses = np.tile(np.eye(4), (2, 1, 1))
+        for i, inverse in enumerate(inverses):
+            inverse[:3, :3] = R[i, frame].T
+            inverse[:3, 3] = -R[i, frame].T @ t[i, frame]
+        offsets = [inverse @ links[i][name] for i, inverse in enumerate(inverses)]
         if np.allclose(offsets[0], offsets[1], atol=1e-9):
             chain = [frame] if frame > 0 else []
             while chain and parent[chain[-1]] > 0:
                 chain.append(int(parent[chain[-1]]))
             return Tip(frame, offsets[0], tuple(chain))
     raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
-
-
-def _rigid_inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = R.T
-    T[:3, 3] = -R.T @ t
-    return T
 
 
 def descend(

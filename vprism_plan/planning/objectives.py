@@ -75,10 +75,7 @@ class RiskObjective:
         return preparation(checker, self.kind) if isinstance(self.kind, str) else ()
 
     def cost(self, checker: Any) -> "PathCost":
-        """Return what paths of a checker's robot cost; draws worlds if nobody has.
-
-        Where worlds are asked about, they are baked then: by the search, within its limit.
-        """
+        """Return what paths of a checker's robot cost; draws worlds if nobody has."""
         return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
 
 
@@ -90,13 +87,9 @@ class MotionRisk:
     worked through in one compiled call, and its cost is remembered.
 
     `VPrismRiskObjective` says what the kinds are. p of "survival" is a bound from above of the
-    marginal that `checker.collision_probability(q)` gives. Integrals are over the way of the
-    sphere that moves farthest (a bound on it, metres), by the trapezoidal rule. "joint",
-    summed over a path's edges, bounds -log(1 - risk) of the path if touching on one edge does
-    not make touching on another less likely.
-
-    Raises:
-        PlanningError: an unknown kind, a spacing out of range, or no posterior.
+    marginal that `checker.collision_probability(q)` gives. Integrals are by the trapezoidal
+    rule. "joint", summed over a path's edges, bounds -log(1 - risk) of the path if touching on
+    one edge does not make touching on another less likely.
     """
 
     def __init__(self, checker: Any, kind: str, spacing: float) -> None:
@@ -129,7 +122,7 @@ class MotionRisk:
         self._tables = self._at.sphere_tables
 
     def motion(self, qa: Configuration, qb: Configuration) -> float:
-        """Return the cost of the straight motion between two configurations, either way."""
+        """Return the cost of the straight motion, either way."""
         a, b = qa.tobytes(), qb.tobytes()
         if a > b:  # in one order, so that both directions cost the same to the last bit
             a, b, qa, qb = b, a, qb, qa
@@ -195,11 +188,7 @@ class MotionRisk:
 
 
 def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
-    """The long parts of making a `MotionRisk`, in turn; what one has done is kept.
-
-    Raises:
-        PlanningError: the checker has no posterior.
-    """
+    """The long parts of making a `MotionRisk`, in turn; what one has done is kept."""
     if not hasattr(checker, "risk_setting"):
         raise PlanningError(
             f"a {type(checker).__name__} has no posterior to take risks from; give a "
@@ -260,7 +249,7 @@ def _field(worlds: Any, world: Any, kind: str) -> Grid:
 
 
 class _FunctionRisk:
-    """`MotionRisk` for rates that a user's function gives; "metres" are those of joint space."""
+    """`MotionRisk` for a user's rates; "metres" are those of joint space."""
 
     def __init__(self, rates: Rates, spacing: float) -> None:
         self._rates, self._spacing = rates, spacing
@@ -314,11 +303,11 @@ class PathCost:
         worst: bool = False,
     ) -> None:
         RiskObjective(kind, spacing, length_weight, worst)  # refuses what is out of range
-        self.risk: MotionRisk | _FunctionRisk = (
-            MotionRisk(checker, kind, spacing)
-            if isinstance(kind, str)
-            else _FunctionRisk(kind, spacing)
-        )
+        self.risk: MotionRisk | _FunctionRisk
+        if isinstance(kind, str):
+            self.risk = MotionRisk(checker, kind, spacing)
+        else:
+            self.risk = _FunctionRisk(kind, spacing)
         self.length_weight = float(length_weight)
         self.worst = worst
         self._wraps = np.asarray(checker.robot.continuous, dtype=bool)
@@ -338,8 +327,7 @@ class PathCost:
         return max(costs, default=0.0) if self.worst else float(sum(costs))
 
     def _distance(self, step: Configuration) -> float:
-        """Length in `state_space`: Euclidean over each run of limited joints, the angle of each
-        continuous one, all summed."""
+        """Length in `state_space`, which says how."""
         wraps, step = self._wraps, np.abs(step)
         if not wraps.any():
             return float(np.linalg.norm(step))
@@ -391,10 +379,8 @@ class VPrismRiskObjective(_RiskBase):
     Args:
         si: the space information; one dimension per joint, flat order.
         checker: a `CollisionChecker` over a `World`; with a function anything with `robot`.
-        kind: see above.
-        spacing: metres of sphere motion between samples.
-        length_weight: cost per unit of the space's distance; at least 0.
-        cost: in place of the last three, something prepared by `RiskObjective.cost`.
+        kind, spacing, length_weight: as in `RiskObjective`.
+        cost: in place of these, something prepared by `RiskObjective.cost`.
 
     Raises:
         PlanningError: a value out of range, or a checker without a posterior.
@@ -463,10 +449,3 @@ class VPrismMinimaxRiskObjective(_RiskBase):
     def identityCost(self) -> Any:  # noqa: N802 - OMPL's name
         """Return zero, which no rate is below."""
         return ob.Cost(0.0)
-
-
-def make_objective(si: Any, checker: Any, cost: PathCost) -> Any:
-    """Return the OMPL objective for a prepared cost."""
-    if cost.worst:
-        return VPrismMinimaxRiskObjective(si, checker, cost=cost)
-    return VPrismRiskObjective(si, checker, cost=cost)

@@ -144,20 +144,14 @@ def _cut(
     if not _no_dearer(cost, path, shorter) or not check(start, end):
         return None
     # Splitting an accepted edge makes new edges: they have to pass by themselves.
-    if a is not None and not check(path[i], a):
-        return None
-    if b is not None and not check(b, path[j + 1]):
-        return None
-    return shorter
+    passed = (a is None or check(path[i], a)) and (b is None or check(b, path[j + 1]))
+    return shorter if passed else None
 
 
 def _point(
     path: Waypoints, along: Float[np.ndarray, " t"], s: float
 ) -> tuple[int, Configuration | None, float]:
-    """Return the edge that holds arc length s, the point there, and s.
-
-    Near a waypoint: its index, None, and its arc length.
-    """
+    """Edge that holds arc length s, the point there, s; near a waypoint its index, None, its s."""
     nearest = int(np.argmin(np.abs(along - s)))
     if abs(along[nearest] - s) <= _SNAP * along[-1]:
         return nearest, None, float(along[nearest])
@@ -252,11 +246,9 @@ def verified(
     if refused:
         _log.warning("edge %d of the final path failed its verification", edge)
         reason = "it leaves the joint limits" if beyond else one_line(verdicts[-1])
+        which = f"edge {edge} of {len(path) - 1} of the final path"
+        message = f"{which} was refused when checked again: {reason}"
         report = replace(report, goal_index=None)
-        message = (
-            f"edge {edge} of {len(path) - 1} of the final path was refused when checked again: "
-            f"{reason}"
-        )
         return PlanResult(None, "verification_failed", report, message, path, verdicts[-1])
     clearances = [checker.clearance(q) for q in interpolated(path, clearance_step)]
     shares: dict[str, float] = {}

@@ -130,7 +130,7 @@ def plan(
             goals, cost, report = found
             query = Query(
                 q_start, goals, asked, cost, warm_start and stop != "first", simplify,
-                float(simplify_time), interpolate, clearance_step, now,
+                float(simplify_time), interpolate, clearance_step,
             )  # fmt: skip
             found = within_risk(
                 judge,
@@ -158,8 +158,8 @@ def _widest(
 ) -> PlanResult:
     """Return the answer with the widest margin that has a path, else the last answer."""
     steps = np.asarray(margins, dtype=np.float64)
-    good = steps.ndim == 1 and len(steps) > 0 and np.isfinite(steps).all()
-    if not (good and (steps >= 0.0).all() and (np.diff(steps) < 0.0).all()):
+    good = steps.ndim == 1 and len(steps) > 0 and steps[-1] >= 0.0 and steps[0] < np.inf
+    if not (good and (np.diff(steps) < 0.0).all()):
         raise PlanningError(
             f"margins is {margins!r}; it must hold decreasing margins of at least 0 m, such as "
             "(0.02, 0.01, 0.005, 0.0)"
@@ -169,9 +169,9 @@ def _widest(
             f"a {type(checker).__name__} has no with_extra_margin; give a CollisionChecker"
         )
     left = time_limit
-    for number, step in enumerate(steps.tolist()):
+    for k, step in enumerate(steps.tolist()):
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
-        share = left / (len(steps) - number) if left > 0.0 else time_limit / len(steps)
+        share = left / (len(steps) - k) if left > 0.0 else time_limit / len(steps)
         began = now()
         result = answer(judge, share)
         left -= now() - began
@@ -259,7 +259,7 @@ def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
 
 
 def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResult:
-    """Say in the report, and the message, what the robot ends touching because it may."""
+    """Say what the robot ends touching because it may."""
     if result.path is None:
         return result
     touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))

@@ -30,12 +30,7 @@ class Improvement:
 
 @dataclass(frozen=True)
 class RefusedGoal:
-    """A configuration that reaches the goal but that nobody may be in.
-
-    Attributes:
-        q: (dof,) radians and metres.
-        reason: what the checker says.
-    """
+    """A configuration q (dof,) that reaches the goal but is invalid; why, by the checker."""
 
     q: tuple[float, ...]
     reason: str

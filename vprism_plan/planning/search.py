@@ -20,7 +20,11 @@ from ompl import util as ou
 
 from vprism_plan._arguments import choice, number, whole
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning.objectives import PathCost, make_objective
+from vprism_plan.planning.objectives import (
+    PathCost,
+    VPrismMinimaxRiskObjective,
+    VPrismRiskObjective,
+)
 from vprism_plan.planning.ompl_adapter import (
     StateReader,
     VPrismMotionValidator,
@@ -91,6 +95,11 @@ class SearchRequest:
             set_(self, "step", number("step", self.step, 0.0, above=True, error=PlanningError))
         set_(self, "seed", checked_seed(self.seed))
 
+    @property
+    def now(self) -> Now:
+        """Reads the clock, seconds."""
+        return CLOCKS[self.clock]
+
 
 @dataclass(frozen=True)
 class SearchOutcome:
@@ -152,13 +161,12 @@ def search(
         planner.setup()
 
         reader = StateReader(space, len(start))
-        now = CLOCKS[request.clock]
-        began = now()
+        began = request.now()
         if held is None:
             status, history = _solve(planner, problem, reader, start, request, guided)
         else:
             status, history = held.solve(planner, time_is_up(request.clock, request.time_limit)), ()
-        planned = now()
+        took = request.now() - began
 
         verdict: Literal["exact", "approximate", "timeout"] = "timeout"
         path, goal_index = None, None
@@ -173,7 +181,7 @@ def search(
             verdict = "exact" if claimed and goal_index is not None else "approximate"
             path = _waypoints(reader, solution, start)
         return SearchOutcome(
-            verdict, path, goal_index, planned - began, states.checks, motions.checks, history
+            verdict, path, goal_index, took, states.checks, motions.checks, history
         )
 
 
@@ -182,13 +190,13 @@ def _set_objective(
 ) -> None:
     kind = planner_kind(request.planner)
     if cost is not None and kind.honours_objective:
-        objective = make_objective(si, checker, cost)
+        risk = VPrismMinimaxRiskObjective if cost.worst else VPrismRiskObjective
+        objective = risk(si, checker, cost=cost)
     elif kind.starts_thread:
         objective = ob.PathLengthOptimizationObjective(si)  # the only one that is no Python
     elif kind.optimising or kind.honours_objective:
         compound = si.getStateSpace().isCompound()
-        length = SpaceLengthObjective if compound else ob.PathLengthOptimizationObjective
-        objective = length(si)
+        objective = (SpaceLengthObjective if compound else ob.PathLengthOptimizationObjective)(si)
     else:
         return
     if request.stop == "first" and kind.obeys_threshold:
@@ -207,7 +215,7 @@ def _solve(
 ) -> tuple[Any, tuple[Improvement, ...]]:
     """Run the planner until it is done or has to stop; note every better path on the way."""
     kind = planner_kind(request.planner)
-    now = CLOCKS[request.clock]
+    now = request.now
     began = now()
     end = began + request.time_limit
     if not (kind.optimising and kind.reports_cost):
@@ -319,7 +327,7 @@ class _HeldErrors:
             return False
 
     def solve(self, planner: Any, timed: Any) -> Any:
-        """Run a planner and return its status, or raise what was held back."""
+        """Return the planner's status, or raise what was held back."""
         self._stop = timed.terminate
         status = planner.solve(timed)
         self._stop = None
@@ -355,8 +363,7 @@ _saved_level: Any = None
 def quiet_ompl() -> Iterator[None]:
     """Silence OMPL's console log inside the block and restore its level afterwards.
 
-    The level is global to the process. Blocks may nest or overlap between threads:
-    the first one in saves the level, the last one out restores it.
+    The level is global to the process; blocks may nest or overlap between threads.
     """
     global _quiet_depth, _saved_level  # noqa: PLW0603 - OMPL's level is global itself
     with _lock:

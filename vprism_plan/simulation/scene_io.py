@@ -41,11 +41,14 @@ def _from_dict(data: dict[str, Any]) -> Scene:
         raise ObservationError(
             f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
         )
-    camera = data["camera"]
+    camera: dict[str, Any] = {
+        name: np.asarray(value, np.float64) if isinstance(value, list) else value
+        for name, value in data["camera"].items()
+    }
     return Scene(
         tuple(solid_from_dict(solid) for solid in data["solids"]),
         tuple(data["labels"]),
-        Camera(**{k: np.array(v, float) if isinstance(v, list) else v for k, v in camera.items()}),
+        Camera(**camera),
         None if data["noise"] is None else DepthNoise(**data["noise"]),
         data["seed"],
         data["name"],
