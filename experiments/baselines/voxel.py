@@ -48,11 +48,6 @@ class VoxelReconstruction:
         found[inside] = self.classes[tuple(index[inside].T)]
         return one_hot(found, len(self.object_ids) + 1)
 
-    def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """Return the corners (m) of the grid."""
-        lower = self.edge * (self.first - 0.5)
-        return lower, lower + self.edge * np.array(self.classes.shape)
-
 
 def fit(observation: Observation, seed: int, edge: float = VOXEL) -> VoxelReconstruction:
     """Label voxels of `edge` (m): occupied, passed by a ray, or as the nearest of either.

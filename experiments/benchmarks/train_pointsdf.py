@@ -17,7 +17,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -194,13 +194,13 @@ def main() -> None:
             "objects": f"random-train 000 to {HELD_OUT_OBJECT - 1}", "examples": len(examples),
             "validation": sizes,
         },
-        "schedule": schedule.to_dict(),
-        "kept": replace(best, iou=final).to_dict(),
+        "schedule": asdict(schedule),
+        "kept": asdict(replace(best, iou=final)),
         "levels": list(LEVELS),
         "commit": commit(),
     }  # fmt: skip
     save_network(model, args.output, history)
-    full = {**history, "looks": [look.to_dict() for look in looks]}
+    full = {**history, "looks": [asdict(look) for look in looks]}
     write_text(args.data / "training.json", json.dumps(full, indent=1) + "\n")
     picture(looks, args.data / "training.png")
     size = args.output.stat().st_size / 1e6

@@ -35,8 +35,6 @@ from vprism_plan.world.config import OccludedPolicy
 from vprism_plan.world.distance import Lattice
 from vprism_plan.world.visibility import background_points
 
-__all__ = ["Bench", "known_nodes"]
-
 _OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things
 _CELLS = 2  # cells per grid step that observed points mark
 OCTOMAP_OCCUPIED = 1

@@ -17,8 +17,6 @@ from experiments.planning_benchmark.contenders import full_label
 from experiments.planning_benchmark.summary import Outcome
 from vprism_plan._files import write_text
 
-__all__ = ["log_text", "write_log"]
-
 _STATUS = (
     "exact", "approximate", "timeout", "invalid_start", "invalid_goal", "verification_failed",
     "too_risky",

@@ -25,8 +25,6 @@ from experiments.planning_benchmark.summary import (
 from vprism_plan._files import write_text
 from vprism_plan.errors import ConfigError
 
-__all__ = ["benchmark", "markdown", "write_report"]
-
 KEY = "planning"
 _KNOWN = {
     "seen": "what the camera saw",

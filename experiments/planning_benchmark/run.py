@@ -19,8 +19,6 @@ from experiments.tables import scoring
 from experiments.tables.sweep import Case, SweepError, sweep
 from vprism_plan.errors import ConfigError
 
-__all__ = ["Found", "answers_of", "run"]
-
 # Of what an answer means, part of every question: raised by hand whenever the robot, the
 # planner, a world, a checker or the scenes change what they answer to the same settings.
 VERSION = 4

@@ -11,10 +11,9 @@ from jaxtyping import Float
 
 from experiments.planning_benchmark.asking import Answer
 from experiments.planning_benchmark.contenders import CONTENDERS, Contender, full_label
+from experiments.stored import Stored
 from experiments.tables.intervals import Estimate, Statistic, ratio
 from vprism_plan.errors import ConfigError
-
-__all__ = ["OURS", "Outcome", "Statement", "outcomes", "statements"]
 
 DEEP = 0.005  # metres of penetration that are more than a graze
 OURS = "ours"  # what our contenders' keys begin with
@@ -170,7 +169,7 @@ def outcomes(found: Sequence[dict[str, Any]]) -> list[Outcome]:
 
 
 @dataclass(frozen=True)
-class Statement:
+class Statement(Stored):
     """A comparison of our curve with one contender.
 
     Attributes:
@@ -190,10 +189,6 @@ class Statement:
     ours: float
     quotient: Estimate
     reached: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return {**vars(self), "quotient": self.quotient.to_dict()}
 
 
 def front(

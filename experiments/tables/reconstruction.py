@@ -18,12 +18,10 @@ from experiments.tables import scoring
 from experiments.tables.claims import Verdict, claims_of, decide
 from experiments.tables.intervals import SceneScores
 from experiments.tables.report import write_report
-from experiments.tables.results import SetResults, Table, TableResults, summary
+from experiments.tables.results import SetResults, Table, TableResults
 from experiments.tables.store import Case, require_writable
 from experiments.tables.sweep import SweepError, sweep
 from vprism_plan.errors import ConfigError
-
-__all__ = ["TABLES", "SetResults", "Table", "TableResults", "chosen_table", "run", "summary"]
 
 TABLES = {
     table.key: table

@@ -22,8 +22,6 @@ from experiments.tables.backends import one_thread, parallel, use_one_thread
 from experiments.tables.store import Case, Store, require_writable
 from vprism_plan.errors import ConfigError, VPrismError
 
-__all__ = ["Case", "Failure", "SweepError", "SweepInputError", "sweep"]
-
 _log = logging.getLogger(__name__)
 _LINE_EVERY = 30.0  # seconds between two lines of progress where no terminal shows a bar
 
