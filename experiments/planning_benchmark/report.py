@@ -47,11 +47,8 @@ def benchmark(
     criteria: Criteria | None = None,
     limits: Limits | None = None,
     data: Path | None = None,
-    jobs: int = 2,
-    backend: str = "loky",
-    progress: bool = True,
-    cluster: Any = None,
     command: str = "",
+    **how: Any,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run the benchmark on `scenes` scenes in all, shared out among the kinds, and write it.
 
@@ -60,8 +57,7 @@ def benchmark(
         scenes: in all.
         output: folder of the reports.
         command: that reprints them.
-        first_seed, store, checkers, count, criteria, limits, data, jobs, backend, progress,
-            cluster: see `run`.
+        first_seed, store, checkers, count, criteria, limits, data, how: see `run`.
 
     Returns:
         The figures, ready for JSON, and the files written.
@@ -83,8 +79,7 @@ def benchmark(
         own = scenes // len(kinds) + (number < scenes % len(kinds))
         found[kind] = run(
             kind, own, first_seed, checkers=chosen, count=count, criteria=criteria,
-            limits=limits, store=store, data=data if kind in ("ycb", "folder") else None,
-            jobs=jobs, backend=backend, progress=progress, cluster=cluster,
+            limits=limits, store=store, data=data if kind in ("ycb", "folder") else None, **how,
         )  # fmt: skip
     answers = [entry for own in found.values() for entry in own.answers]
     failures = [own.failed for own in found.values() if own.failed is not None]

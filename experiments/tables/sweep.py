@@ -136,6 +136,19 @@ def sweep(
     return [answer for answer in answers if answer is not None]
 
 
+def sweep_complete(
+    task: Task, cases: Sequence[Case], store: Path, *, group: Callable[[Case], Hashable], **how: Any
+) -> tuple[list[Case], list[dict[str, Any]], SweepError | None]:
+    """Return the cases of all groups without a failure, their answers, and what failed."""
+    try:
+        return list(cases), sweep(task, cases, store, group=group, **how), None
+    except SweepError as failed:
+        names = {failure.name for failure in failed.failures}
+        lost = {group(case) for case in cases if case.name in names}
+        kept = [case for case in cases if group(case) not in lost]
+        return kept, sweep(task, kept, store, group=group, **how), failed
+
+
 def _refuse_duplicates(kept: Store, cases: Sequence[Case]) -> None:
     seen: dict[str, str] = {}
     for case in cases:

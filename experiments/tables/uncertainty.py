@@ -124,11 +124,9 @@ def run(
     data: Path | None = None,
     store: Path,
     output: Path,
-    jobs: int = 2,
-    backend: str = "loky",
-    cluster: Any = None,
     command: str = "",
     real: Path | None = None,
+    **how: Any,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Compare the entropy of V-PRISM with a point estimate's; return figures and files.
 
@@ -138,10 +136,10 @@ def run(
         data: folder of meshes, for the sets that need one.
         store: folder of answers.
         output: folder of uncertainty.md, .json and pictures.
-        jobs, backend, cluster: see `sweep`.
         command: that reprints this, for the report.
         real: folder of real depth images; None looks where $VPRISM_PLAN_REAL says, and in
             ../shared/data/real beside the checkout. Without any they are left out.
+        how: jobs, backend, cluster, progress: see `sweep`.
 
     Raises:
         ConfigError: unknown set, no scene, missing data, or a folder that cannot be written.
@@ -156,9 +154,7 @@ def run(
         replace(one, asked={**one.asked, "scores": _VERSION})
         for one in scoring.cases_of_sets(kinds, seeds, METHODS, data)
     ]
-    answers = sweep(
-        compare, cases, store, jobs=jobs, backend=backend, group=scoring.scene_of, cluster=cluster
-    )
+    answers = sweep(compare, cases, store, group=scoring.scene_of, **how)
     with one_thread():  # as the workers that computed the answers
         frames = real_observations(real)
         fits = [{key: method(key).fit(seen, 0) for key in METHODS} for _, seen in frames]

@@ -84,10 +84,8 @@ class ReachRegion:
         set_(self, "pose", rigid_pose("pose of a region", self.pose, error=PlanningError))
         extent = np.atleast_1d(np.array(self.extent, dtype=np.float64))
         if extent.shape not in {(1,), (3,)} or not (np.isfinite(extent) & (extent >= 0.0)).all():
-            raise PlanningError(
-                f"extent is {self.extent!r}; it must be one radius or three half edges, metres, "
-                "finite and not negative"
-            )
+            needed = "one radius or three half edges, metres, finite and not negative"
+            raise PlanningError(f"extent is {self.extent!r}; it must be {needed}")
         set_(self, "extent", extent)
         if self.rotation is not None:
             turned = np.eye(4)
@@ -226,10 +224,8 @@ def configuration(q: Any, robot: Any, what: str) -> Configuration:
     """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
     array = _numbers(q, robot, what)
     if array.shape != (robot.dof,):
-        raise PlanningError(
-            f"{what} has shape {array.shape}; it must be ({robot.dof},), one value per joint: "
-            f"{', '.join(robot.joint_names)}"
-        )
+        joints = f"({robot.dof},), one value per joint: {', '.join(robot.joint_names)}"
+        raise PlanningError(f"{what} has shape {array.shape}; it must be {joints}")
     if not np.isfinite(array).all():
         raise PlanningError(f"{what} is {array}; every joint value must be finite")
     return array

@@ -190,10 +190,8 @@ class MotionRisk:
 def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
     """The long parts of making a `MotionRisk`, in turn; what one has done is kept."""
     if not hasattr(checker, "risk_setting"):
-        raise PlanningError(
-            f"a {type(checker).__name__} has no posterior to take risks from; give a "
-            "CollisionChecker over a World, or a function as the kind of risk"
-        )
+        other = "a CollisionChecker over a World, or a function as the kind of risk"
+        raise PlanningError(f"a {type(checker).__name__} has no posterior; give {other}")
 
     def worlds() -> Any:
         return checker.risk_setting().worlds
@@ -273,17 +271,14 @@ class _FunctionRisk:
     def _checked(self, Q: np.ndarray) -> np.ndarray:
         """Return the rates at rows of Q; planners crash the process over negative costs."""
         rates = np.asarray(self._rates(Q), dtype=np.float64)
+        wrong = ""
         if rates.shape != (len(Q),):
-            raise PlanningError(
-                f"the function of the objective returned shape {rates.shape} for "
-                f"configurations {Q.shape}; it must return ({len(Q)},), one rate each"
-            )
-        bad = np.flatnonzero(~(np.isfinite(rates) & (rates >= 0.0)))
-        if len(bad):
-            raise PlanningError(
-                f"the function of the objective returned {rates[bad[0]]} at "
-                f"{Q[bad[0]].tolist()}; rates must be finite and at least 0"
-            )
+            wrong = f"shape {rates.shape} for {Q.shape}; it must be ({len(Q)},), one rate each"
+        elif (bad := ~(np.isfinite(rates) & (rates >= 0.0))).any():
+            k = int(np.argmax(bad))
+            wrong = f"{rates[k]} at {Q[k].tolist()}; rates must be finite and at least 0"
+        if wrong:
+            raise PlanningError(f"the function of the objective returned {wrong}")
         return rates
 
 

@@ -59,10 +59,8 @@ def state_space(robot: RobotLike) -> Any:
     upper = np.asarray(robot.upper, dtype=np.float64)
     for name, low, high, free in zip(robot.joint_names, lower, upper, continuous, strict=True):
         if not free and not (np.isfinite(low) and np.isfinite(high) and low < high):
-            raise PlanningError(
-                f"joint {name!r} has limits [{low}, {high}]; a limited joint needs finite limits "
-                "with lower < upper (lock the joint if it should not move)"
-            )
+            needed = "finite ones with lower < upper are needed (lock what should not move)"
+            raise PlanningError(f"joint {name!r} has limits [{low}, {high}]; {needed}")
     if not continuous.any():
         return _real_vector(lower, upper)
     compound = ob.CompoundStateSpace()
@@ -88,10 +86,7 @@ def _real_vector(lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"])
 
 
 def _parts(space: Any, state: Any = None) -> Iterator[tuple[bool, int, Any]]:
-    """Yield of each part, depth first, whether it is a circle, its size, and its state.
-
-    Raises PlanningError for spaces that do not interpolate in straight lines.
-    """
+    """Of each part, depth first: whether it is a circle, its size, its state."""
     # The OMPL class, also behind a user's Python subclass.
     names = (c.__name__ for c in type(space).__mro__ if c.__module__.startswith("ompl."))
     kind = next(names, type(space).__name__)
@@ -101,10 +96,8 @@ def _parts(space: Any, state: Any = None) -> Iterator[tuple[bool, int, Any]]:
         for i, part in enumerate(space.getSubspaces()):
             yield from _parts(part, None if state is None else state[i])
     else:
-        raise PlanningError(
-            f"the state space contains a {kind}; use RealVectorStateSpace, SO2StateSpace, or a "
-            "CompoundStateSpace of them, whose motions are straight lines in joint space"
-        )
+        straight = "RealVectorStateSpace, SO2StateSpace, or a CompoundStateSpace of them"
+        raise PlanningError(f"the state space contains a {kind}; use {straight}")
 
 
 def wrapping_coordinates(space: Any) -> tuple[bool, ...]:
@@ -171,8 +164,8 @@ def write_state(space: Any, q: Configuration, state: Any) -> None:
             part[i] = next(values)
 
 
-def _capsule(buffer: Float[np.ndarray, " dof"]) -> Any:
-    """Return what lets OMPL write to an array."""
+def _capsule(buffer: Configuration) -> Any:
+    """What lets OMPL write to an array."""
     return _new_capsule(buffer.ctypes.data, _CAPSULE_NAME, None)
 
 
@@ -198,7 +191,7 @@ class StateReader:
         if len(self.wraps) != dof:
             raise PlanningError(
                 f"the state space has {len(self.wraps)} dimensions but the robot has {dof} joints; "
-                "build the space with state_space(robot), or give it one dimension per joint"
+                "make it by state_space(robot)"
             )
         self.space = space
         self.fast = _serialisation_works(space, dof)
@@ -331,9 +324,9 @@ def last_valid(
 ) -> tuple[Configuration | None, float]:
     """Return how far the straight motion from qa to qb, both (dof,), is certified valid.
 
-    Bisects with `checker.check_motion`, so every part up to the answer is certified, until the
-    interval is `tolerance`, a fraction of the motion. Returns the furthest certified
-    configuration and its fraction in [0, 1]; (None, 0.0) if qa itself is invalid.
+    Bisects with `checker.check_motion` until the interval is `tolerance`, a fraction of the
+    motion. Returns the furthest certified configuration and its fraction in [0, 1]; (None, 0.0)
+    if qa itself is invalid.
     """
     qa = joint_values(qa, checker.robot, "qa")
     qb = joint_values(qb, checker.robot, "qb")

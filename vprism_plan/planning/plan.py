@@ -160,14 +160,11 @@ def _widest(
     steps = np.asarray(margins, dtype=np.float64)
     good = steps.ndim == 1 and len(steps) > 0 and steps[-1] >= 0.0 and steps[0] < np.inf
     if not (good and (np.diff(steps) < 0.0).all()):
-        raise PlanningError(
-            f"margins is {margins!r}; it must hold decreasing margins of at least 0 m, such as "
-            "(0.02, 0.01, 0.005, 0.0)"
-        )
+        needed = "decreasing margins of at least 0 m, such as (0.02, 0.01, 0.005, 0.0)"
+        raise PlanningError(f"margins is {margins!r}; it must hold {needed}")
     if not hasattr(checker, "with_extra_margin"):
-        raise PlanningError(
-            f"a {type(checker).__name__} has no with_extra_margin; give a CollisionChecker"
-        )
+        who = type(checker).__name__
+        raise PlanningError(f"a {who} has no with_extra_margin; give a CollisionChecker")
     left = time_limit
     for k, step in enumerate(steps.tolist()):
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
@@ -205,24 +202,20 @@ def _prepared(
     if kind.starts_thread and len(goals) > 1:
         raise PlanningError(
             f"{request.planner} deadlocks with more than one goal configuration, here "
-            f"{len(goals)}; give one, or use RRTConnect, or another of `planners()` that starts "
-            "no thread"
+            f"{len(goals)}; give one, or use RRTConnect"
         )
     asked = 1 + len(goals) + len(report.refused_goals)
     report = replace(report, state_checks=asked, motion_checks=len(goals))
     if objective == "length":
         return goals, None, report
     if not isinstance(objective, RiskObjective):
-        raise PlanningError(
-            f"objective is {objective!r}; it must be 'length' or a RiskObjective, for example "
-            "RiskObjective(kind='joint')"
-        )
+        needed = "'length' or a RiskObjective, for example RiskObjective(kind='joint')"
+        raise PlanningError(f"objective is {objective!r}; it must be {needed}")
     if not kind.honours_objective:
         able = ", ".join(name for name, k in planners().items() if k.honours_objective)
-        raise PlanningError(
-            f"{request.planner} does not honour an objective{': it ' if kind.note else ''}"
-            f"{kind.note}; planners that do are {able}"
-        )
+        why = f": it {kind.note}" if kind.note else ""
+        who = f"{request.planner} does not honour an objective{why}"
+        raise PlanningError(f"{who}; planners that do are {able}")
     began, cost = now(), None
     for step in objective.preparation(checker):
         step()
@@ -236,8 +229,7 @@ def _prepared(
         return goals, cost, report
     message = (
         f"preparing the objective '{objective.name}' took {took:.2f} s of the "
-        f"{request.time_limit:g} s allowed; what was prepared is kept: allow more time, plan "
-        "again, or prepare it ahead by objective.cost(checker)"
+        f"{request.time_limit:g} s allowed; it is kept: plan again, or allow more time"
     )
     return PlanResult(None, "timeout", report, message)
 
@@ -247,15 +239,12 @@ def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
     if judge is None:
         return
     if not isinstance(judge, SecondOpinion):
-        raise PlanningError(
-            f"second_opinion is a {type(judge).__name__} without 'robot' and 'review'; give a "
-            "MeshChecker, or None"
-        )
+        who = f"a {type(judge).__name__} without 'robot' and 'review'"
+        raise PlanningError(f"second_opinion is {who}; give a MeshChecker, or None")
     ours, theirs = tuple(checker.robot.joint_names), tuple(judge.robot.joint_names)
     if ours != theirs:
-        raise PlanningError(
-            f"second_opinion is about a robot with joints {theirs}; the checker's are {ours}"
-        )
+        whose = f"{theirs}; the checker's are {ours}"
+        raise PlanningError(f"second_opinion is about a robot with joints {whose}")
 
 
 def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResult:

@@ -70,26 +70,19 @@ class SearchRequest:
         kind = planner_kind(self.planner)
         choice("clock", self.clock, CLOCKS, error=PlanningError)
         if kind.starts_thread and self.clock != "wall":
-            raise PlanningError(
-                f"clock is {self.clock!r} with {self.planner}: its second thread would wait for "
-                "ever for a termination condition that is Python; use clock='wall'"
-            )
+            why = f"{self.planner}'s second thread would wait for ever"
+            raise PlanningError(f"clock is {self.clock!r}: {why}; use clock='wall'")
         if self.stop == "converged" and kind.optimising and not kind.reports_cost:
-            raise PlanningError(
-                f"{self.planner} does not say what its path costs; use stop='limit'"
-            )
+            who = self.planner
+            raise PlanningError(f"{who} does not say what its path costs; use stop='limit'")
         set_ = object.__setattr__
-        limit = number(
-            "time_limit", self.time_limit, 0.0, unit="s", above=True, error=PlanningError
-        )
+        limit = number("time_limit", self.time_limit, 0.0, above=True, error=PlanningError)
         set_(self, "time_limit", limit)
         choice("stop", self.stop, ("limit", "first", "converged"), error=PlanningError)
         tolerance, patience = self.convergence
         if not (0.0 < tolerance < 1.0 and patience >= 1):
-            raise PlanningError(
-                f"convergence is {self.convergence!r}; it must be (tolerance in (0, 1), patience "
-                "of at least 1 iteration)"
-            )
+            needed = "(tolerance in (0, 1), patience of at least 1 iteration)"
+            raise PlanningError(f"convergence is {self.convergence!r}; it must be {needed}")
         set_(self, "convergence", (float(tolerance), int(patience)))
         if self.step is not None:
             set_(self, "step", number("step", self.step, 0.0, above=True, error=PlanningError))
@@ -153,8 +146,7 @@ def search(
         if lead is not None:
             planner.setProblemDefinition(problem)
             planner.setup()  # settles the planner's steps
-            guided = GuidedGoal(si, goals, request.seed, planner.getRange())
-            guided.lead(lead)
+            guided = GuidedGoal(si, goals, request.seed, planner.getRange(), lead)
             problem.setGoal(guided)
             planner.setGoalBias(GOAL_BIAS)
         planner.setProblemDefinition(problem)

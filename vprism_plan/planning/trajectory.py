@@ -118,9 +118,8 @@ def time_parameterize(
 def _limits(kind: str, values: ArrayLike, names: tuple[str, ...]) -> Configuration:
     limits = np.asarray(values, dtype=np.float64)
     if limits.shape != (len(names),):
-        raise PlanningError(
-            f"{kind} limits have shape {limits.shape}; one per joint is needed: {', '.join(names)}"
-        )
+        needed = f"one per joint is needed: {', '.join(names)}"
+        raise PlanningError(f"{kind} limits have shape {limits.shape}; {needed}")
     for name, limit in zip(names, limits, strict=True):
         hint = f"(pass {kind}_limits if the robot's description has none)"
         what = f"{kind} limit of joint {name!r}"
@@ -205,10 +204,8 @@ def write_trajectory(
     """
     names = [str(name) for name in robot.joint_names]
     if trajectory.positions.shape[1:] != (len(names),):
-        raise PlanningError(
-            f"the trajectory has {trajectory.positions.shape[1:]} joints, the robot {len(names)}: "
-            f"{', '.join(names)}"
-        )
+        given = f"{trajectory.positions.shape[1:]} joints"
+        raise PlanningError(f"the trajectory has {given}, the robot {', '.join(names)}")
     ticks = [round(float(t) * _NANOSECONDS) for t in trajectory.times]
     if any(b <= a for a, b in pairwise(ticks)):
         raise PlanningError("points of the trajectory are less than a nanosecond apart")

@@ -28,12 +28,25 @@ def _to_dict(scene: Scene) -> dict[str, Any]:
         "seed": scene.seed,
         "labels": list(scene.labels),
         "solids": [solid.to_dict() for solid in scene.solids],
-        "camera": {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(scene.camera).items()
-        },
-        "noise": None if scene.noise is None else asdict(scene.noise),
+        **view_to_dict(scene.camera, scene.noise),
     }
+
+
+def view_to_dict(camera: Camera, noise: DepthNoise | None) -> dict[str, Any]:
+    """Return `camera` and `noise`, JSON-ready and exact."""
+    pose, intrinsics = camera.T_world_camera.tolist(), camera.intrinsics.tolist()
+    return {
+        "camera": {**vars(camera), "T_world_camera": pose, "intrinsics": intrinsics},
+        "noise": None if noise is None else asdict(noise),
+    }
+
+
+def view_from_dict(data: dict[str, Any]) -> tuple[Camera, DepthNoise | None]:
+    """Rebuild what `view_to_dict` described."""
+    camera = dict(data["camera"])
+    for name in ("T_world_camera", "intrinsics"):
+        camera[name] = np.asarray(camera[name], dtype=np.float64)
+    return Camera(**camera), None if data["noise"] is None else DepthNoise(**data["noise"])
 
 
 def _from_dict(data: dict[str, Any]) -> Scene:
@@ -41,18 +54,8 @@ def _from_dict(data: dict[str, Any]) -> Scene:
         raise ObservationError(
             f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
         )
-    camera: dict[str, Any] = {
-        name: np.asarray(value, np.float64) if isinstance(value, list) else value
-        for name, value in data["camera"].items()
-    }
-    return Scene(
-        tuple(solid_from_dict(solid) for solid in data["solids"]),
-        tuple(data["labels"]),
-        Camera(**camera),
-        None if data["noise"] is None else DepthNoise(**data["noise"]),
-        data["seed"],
-        data["name"],
-    )
+    solids, labels = tuple(map(solid_from_dict, data["solids"])), tuple(data["labels"])
+    return Scene(solids, labels, *view_from_dict(data), data["seed"], data["name"])
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:
