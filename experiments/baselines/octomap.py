@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, Int64, UInt8
 
-from experiments.baselines._common import checked_points
-from vprism_plan.errors import MissingDependencyError
+from experiments.protocols import checked_points
+from vprism_plan.errors import MapError, MissingDependencyError
 from vprism_plan.perception.observation import Observation
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class OctoMapReconstruction:
 
     def occupancy(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return the tree's probability of "occupied" at points (n, 3) m; NaN where unknown."""
-        shifted = checked_points(points) + 0.5 * self.cell
+        shifted = checked_points(points, MapError) + 0.5 * self.cell
         index, inverse = np.unique(
             np.floor(shifted / self.cell).astype(np.int64), axis=0, return_inverse=True
         )
@@ -74,7 +74,7 @@ class OctoMapReconstruction:
         the table is certainly no object. Free and unknown cells (0.5, or rather just
         under it) share their probability among all objects.
         """
-        points = checked_points(points)
+        points = checked_points(points, MapError)
         occupancy = self.occupancy(points)
         objects = len(self.object_ids)
         occupied = np.where(np.isnan(occupancy), _UNKNOWN, occupancy)

@@ -14,7 +14,6 @@ on the same machine give the same weights.
 import argparse
 import json
 import os
-import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -28,6 +27,7 @@ from experiments.baselines.pointsdf.shapes import training_scene
 from experiments.baselines.pointsdf.training import LEVELS, Look, Schedule, mean_iou, train
 from experiments.baselines.pointsdf.weights import SHIPPED, save_network
 from experiments.protocols import TrueScene
+from experiments.tables.scoring import commit
 from vprism_plan._files import write_text
 from vprism_plan.simulation.scenes import random_camera
 
@@ -138,15 +138,6 @@ def picture(looks: Sequence[Look], file: Path) -> None:
     right.set(xlabel="step", ylabel="mean IoU", title="objects held out")
     right.legend()
     save_figure(figure, file)
-
-
-def commit() -> str:
-    """Return the commit of the checkout, or "unknown" outside of one."""
-    try:
-        call = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-        return subprocess.run(call, check=True, capture_output=True, text=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
 
 
 def main() -> None:

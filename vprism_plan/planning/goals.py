@@ -132,17 +132,13 @@ class ReachRegion:
             inside = (np.abs(local) <= self.extent + 1e-9).all(axis=1)
         if self.rotation is None:
             return inside
-        return inside & (self._off(rotations) <= self.tilt + 1e-9)
-
-    def _off(self, rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-        """Angle to the wanted orientation, radians."""
-        assert self.rotation is not None
         if self.free_axis is None:
             turns = Rotation.from_matrix(self.rotation @ rotations.transpose(0, 2, 1))
-            return np.asarray(turns.magnitude())
-        now, wanted = rotations @ self.free_axis, self.rotation @ self.free_axis
-        sine = np.linalg.norm(np.cross(now, wanted), axis=1)
-        return np.arctan2(sine, now @ wanted)
+            angle = np.asarray(turns.magnitude())
+        else:
+            now, wanted = rotations @ self.free_axis, self.rotation @ self.free_axis
+            angle = np.arctan2(np.linalg.norm(np.cross(now, wanted), axis=1), now @ wanted)
+        return inside & (angle <= self.tilt + 1e-9)
 
     def draw(self, n: int, rng: np.random.Generator) -> Targets:
         """Draw targets, places uniform in the region, orientations within half the tilt."""
@@ -199,7 +195,7 @@ def _descended(
     seed: int,
     config: PoseGoalConfig,
 ) -> tuple[Tip, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the link, and what `descend` makes of the reference and random starts."""
+    """The link, and what `descend` makes of the reference and random starts."""
     rng = np.random.default_rng(seed)
     tip = find_tip(robot, link, np.random.default_rng(seed))
     lower, upper = np.asarray(robot.lower), np.asarray(robot.upper)
@@ -232,7 +228,6 @@ def configuration(q: Any, robot: Any, what: str) -> Configuration:
 
 
 def _numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
-    """Return a fresh float64 copy, or raise PlanningError naming what cannot be read."""
     try:
         return joint_values(values, robot, what)
     except RobotError as error:

@@ -130,7 +130,13 @@ class MotionRisk:
         if cost is None:
             if len(self._kept) >= _MOST_KEPT:
                 self._kept.clear()
-            cost = self._kept[a, b] = self._cost(qa, qb)
+            rates, cost, way = self._sweep(qa, qb)
+            if self.kind != "joint":
+                cost = 0.0
+                if len(rates) > 1 and rates.any():
+                    inner = rates.sum() - 0.5 * (rates[0] + rates[-1])
+                    cost = float(way * (inner / (len(rates) - 1)))
+            self._kept[a, b] = cost
         return cost
 
     def state(self, q: Configuration) -> float:
@@ -144,15 +150,6 @@ class MotionRisk:
             return self.motion(qa, qb)
         a, b = (qa, qb) if qa.tobytes() <= qb.tobytes() else (qb, qa)
         return float(self._sweep(a, b)[0].max())
-
-    def _cost(self, qa: np.ndarray, qb: np.ndarray) -> float:
-        rates, joint, way = self._sweep(qa, qb)
-        if self.kind == "joint":
-            return joint
-        if len(rates) == 1 or not rates.any():
-            return 0.0
-        mean = (rates.sum() - 0.5 * (rates[0] + rates[-1])) / (len(rates) - 1)
-        return float(way * mean)
 
     def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float, float]:
         """Rates at the samples, -log of the share of worlds touched nowhere, bound on the way."""

@@ -119,7 +119,8 @@ def plan(
         if length is not None or name == "clearance_step":
             number(name, length, 0.0, above=True, finite=False, error=PlanningError)
     number("simplify_time", simplify_time, 0.0, unit="s", finite=False, error=PlanningError)
-    _refuse_unfit(second_opinion, checker)
+    if second_opinion is not None:
+        _require_same_robot(second_opinion, checker)
     q_start = configuration(start, checker.robot, "start")
     now = CLOCKS[clock]
 
@@ -142,7 +143,7 @@ def plan(
                 paid = found.report.path_length if cost is None else cost.path(found.path)
                 found = replace(found, report=replace(found.report, cost=paid))
         found = replace(found, warnings=tuple(getattr(judge, "warnings", ())))
-        return _reviewed(_with_allowed_contacts(found, judge), judge, second_opinion, now)
+        return _annotated(found, judge, second_opinion, now)
 
     if margins is None:
         return answer(checker, request.time_limit)
@@ -234,10 +235,8 @@ def _prepared(
     return PlanResult(None, "timeout", report, message)
 
 
-def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
+def _require_same_robot(judge: Any, checker: CheckerLike) -> None:
     """Raise PlanningError before any search if the judge cannot be asked about its paths."""
-    if judge is None:
-        return
     if not isinstance(judge, SecondOpinion):
         who = f"a {type(judge).__name__} without 'robot' and 'review'"
         raise PlanningError(f"second_opinion is {who}; give a MeshChecker, or None")
@@ -247,30 +246,26 @@ def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
         raise PlanningError(f"second_opinion is about a robot with joints {whose}")
 
 
-def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResult:
-    """Say what the robot ends touching because it may."""
-    if result.path is None:
-        return result
-    touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
-    if not touching:
-        return result
-    named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
-    message = f"{result.message}; ends touching, as allowed: {named}"
-    report = replace(result.report, allowed_contacts=touching)
-    return replace(result, report=report, message=message)
-
-
-def _reviewed(
+def _annotated(
     result: PlanResult, checker: CheckerLike, judge: SecondOpinion | None, now: Now
 ) -> PlanResult:
-    """Say in the report what another judge makes of the path; it is not obeyed."""
-    if judge is None or result.path is None:
+    """Say what a path ends touching because it may, and what another judge makes of it.
+
+    That judge is not obeyed.
+    """
+    if result.path is None:
         return result
-    began = now()
-    opinion = judge.review(checker, result.path)
-    report = replace(result.report, second_opinion=opinion, second_opinion_time=now() - began)
-    if opinion.valid:
-        return replace(result, report=report)
-    says = one_line(opinion)
-    _log.warning("second opinion on the verified path: %s", says)
-    return replace(result, report=report, message=f"{result.message}; but {says}")
+    report, message = result.report, result.message
+    touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
+    if touching:
+        named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
+        report = replace(report, allowed_contacts=touching)
+        message = f"{message}; ends touching, as allowed: {named}"
+    if judge is not None:
+        began = now()
+        opinion = judge.review(checker, result.path)
+        report = replace(report, second_opinion=opinion, second_opinion_time=now() - began)
+        if not opinion.valid:
+            _log.warning("second opinion on the verified path: %s", one_line(opinion))
+            message = f"{message}; but {one_line(opinion)}"
+    return replace(result, report=report, message=message)

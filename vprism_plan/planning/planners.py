@@ -190,12 +190,13 @@ class GuidedGoal(ob.GoalSampleableRegion):
 
     def sampleGoal(self, state: Any) -> None:  # noqa: N802 - OMPL's name
         """Write the next state to grow towards."""
-        q = self._queue.pop() if self._queue else self._around(self.path)
+        q = self._queue.pop() if self._queue else self._around()
         write_state(self._space, q, state)
         self._space.enforceBounds(state)  # OMPL takes a goal's samples as they are
 
-    def _around(self, path: Waypoints) -> Configuration:
-        """Return a state near a random place of a path."""
+    def _around(self) -> Configuration:
+        """A state near a random place of the path."""
+        path = self.path
         lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
         place = self._rng.uniform(0.0, float(lengths.sum()))
         edge = min(int(np.searchsorted(np.cumsum(lengths), place)), len(lengths) - 1)

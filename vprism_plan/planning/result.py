@@ -19,8 +19,8 @@ class Improvement:
     Attributes:
         time: seconds since the search began, on the query's clock.
         cost: by the objective; the planner's own value.
-        path: (T, dof) radians and metres, as the planner found it: each motion passed the
-            check of the search, none was shortened or verified again.
+        path: (T, dof) radians and metres, as the search found and checked it: neither
+            shortened nor verified again.
     """
 
     time: float

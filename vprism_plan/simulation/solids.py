@@ -93,7 +93,7 @@ class Solid(ABC):
         return self._to_world(np.concatenate(ring))
 
     def mesh(self) -> "trimesh.Trimesh":
-        """Return a watertight triangle mesh in the world frame (curved faces in 64 segments)."""
+        """Return a watertight triangle mesh in the world frame, curved faces in 64 segments."""
         import trimesh
 
         return trimesh.creation.revolve(self._profile(), sections=_SEGMENTS, transform=self.pose)
