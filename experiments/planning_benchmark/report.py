@@ -52,15 +52,7 @@ def benchmark(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run the benchmark on `scenes` scenes in all, shared out among the kinds, and write it.
 
-    Args:
-        kinds: sets of scenes; each gets an equal share of `scenes`, at least one.
-        scenes: in all.
-        output: folder of the reports.
-        command: that reprints them.
-        first_seed, store, checkers, count, criteria, limits, data, how: see `run`.
-
-    Returns:
-        The figures, ready for JSON, and the files written.
+    Returns the figures, ready for JSON, and the files. Other arguments are those of `run`.
 
     Raises:
         ConfigError: fewer scenes than kinds; or as `run`.
@@ -105,14 +97,7 @@ def benchmark(
 def write_report(
     found: Sequence[dict[str, Any]], about: dict[str, Any], output: Path
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Write planning.md, .json, .png, -fates.png and .log into a folder.
-
-    Args:
-        found: answers of `run`.
-        about: what was asked: kinds, (scenes of each), replaced, left_out, first_seed,
-            count, criteria, limits, command, commits.
-        output: the folder.
-    """
+    """Write planning.md, .json, .png, -fates.png and .log of answers and what was asked."""
     from experiments.planning_benchmark.pictures import curve_figure, fates_figure
     from vprism_plan.viz._figures import save_figure
 

@@ -56,19 +56,14 @@ def run(
 ) -> Found:
     """Return the answers of every contender on every scene.
 
-    A scene on which a contender raises is left out for all of them.
+    A scene on which a contender raises is left out for all of them. Arguments as those of
+    `tables.reconstruction.run`, and:
 
     Args:
-        kind: "analytic", "ycb", "random", "folder" or "solids".
+        kind: a set of scenes, also "solids" (analytic, without physics).
         scenes: how many; seeds from first_seed on, but those that offer too few problems.
-        first_seed: of the scenes, their problems and the maps.
         checkers: keys of `CONTENDERS`; all if None.
         count: problems per scene.
-        criteria: what the problems must be.
-        limits: planner and time limits.
-        store: folder that keeps every answer.
-        data: folder of meshes, where the kind needs one.
-        how: jobs, backend, progress, cluster: see `tables.sweep.sweep`.
 
     Raises:
         ConfigError: an unknown contender, no scene or problem asked for, or too few scenes

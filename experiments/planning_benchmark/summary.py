@@ -196,12 +196,8 @@ def front(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Return what can be reached by tossing a coin between contenders: the lower hull.
 
-    Args:
-        success: share of the problems with a path.
-        collided: share of the problems whose path collides.
-
-    Returns:
-        Success in rising order from 0, and the least share of collisions there.
+    Of shares of the problems with a path, and whose path collides: success in rising order
+    from 0, and the least share of collisions there.
     """
     points = sorted({(0.0, 0.0), *zip(success.tolist(), collided.tolist(), strict=True)})
     hull: list[tuple[float, float]] = []

@@ -130,20 +130,9 @@ def run(
 ) -> tuple[dict[str, Any], list[Path]]:
     """Compare the entropy of V-PRISM with a point estimate's; return figures and files.
 
-    Args:
-        kinds: sets of scenes (see `generation.source`).
-        scenes, first_seed: seeds of each set.
-        data: folder of meshes, for the sets that need one.
-        store: folder of answers.
-        output: folder of uncertainty.md, .json and pictures.
-        command: that reprints this, for the report.
-        real: folder of real depth images; None looks where $VPRISM_PLAN_REAL says, and in
-            ../shared/data/real beside the checkout. Without any they are left out.
-        how: jobs, backend, cluster, progress: see `sweep`.
-
-    Raises:
-        ConfigError: unknown set, no scene, missing data, or a folder that cannot be written.
-        SweepError: some scenes failed; all others are kept.
+    Arguments and errors as those of `tables.reconstruction.run`, but a failure ends it. `real`
+    is a folder of real depth images; None looks where $VPRISM_PLAN_REAL says, and in
+    ../shared/data/real beside the checkout. Without any they are left out.
     """
     from experiments.tables import uncertainty_report as report
 
