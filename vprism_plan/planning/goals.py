@@ -163,11 +163,11 @@ def solve_pose(
 ) -> Float[np.ndarray, "n dof"]:
     """Find configurations that bring a link to a pose (4, 4) in the world, metres.
 
-    They are distinct, nearest to `reference` first, and not yet checked. The solver starts from
-    `reference`, and at random within the joint limits, in float64, with mimic and continuous
-    joints. (pytorch-kinematics' reads its offsets in float32 and leaves mimic joints out:
-    `experiments.benchmarks.inverse_kinematics`.) Raises PlanningError if the pose is not a
-    rigid transform, or the link is unknown.
+    They are distinct, nearest to `reference` first, and not yet checked. The solver starts there
+    and at random within the joint limits, in float64, with mimic and continuous joints.
+    (pytorch-kinematics' reads its offsets in float32 and leaves mimic joints out:
+    `experiments.benchmarks.inverse_kinematics`.) Raises PlanningError for what is no rigid
+    transform, or an unknown link.
     """
     pose = rigid_pose("goal pose", pose, error=PlanningError)
     n = config.attempts
@@ -261,11 +261,7 @@ def valid_goals(
     config: PoseGoalConfig,
     report: PlanReport,
 ) -> tuple[Float[np.ndarray, "g dof"], PlanReport] | PlanResult:
-    """Return valid goal configurations (g, dof) and the report of the others, or the refusal.
-
-    Of those that reach a pose or a region as many are kept as `config` allows, of those that
-    the caller gave all.
-    """
+    """Return valid goal configurations (g, dof) and the report of the others, or the refusal."""
     robot = checker.robot
     array = np.empty(0) if isinstance(goal, ReachRegion) else _numbers(goal, robot, "goal")
     if isinstance(goal, ReachRegion):
@@ -288,7 +284,7 @@ def valid_goals(
     good: list[np.ndarray] = []
     refused: list[PlanResult] = []
     notes: list[RefusedGoal] = []
-    most = config.max_goals if what else len(found)
+    most = config.max_goals if what else len(found)  # the caller's own are all kept
     for q in found:
         refusal = refuse(checker, q, "goal", report)
         if refusal is None:

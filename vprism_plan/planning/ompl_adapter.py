@@ -103,7 +103,7 @@ def _parts(space: Any, state: Any = None) -> Iterator[tuple[bool, int, Any]]:
 def wrapping_coordinates(space: Any) -> tuple[bool, ...]:
     """Return, per flat coordinate, whether the space wraps it at +-pi (SO2).
 
-    Raises PlanningError for spaces that do not interpolate in straight lines.
+    Raises PlanningError for spaces whose motions are no straight lines.
     """
     return tuple(circle for circle, size, _ in _parts(space) for _ in range(size))
 
@@ -136,10 +136,7 @@ def to_array(space: Any, state: Any) -> Configuration:
 
 
 def to_state(space: Any, q: Configuration) -> Any:
-    """Return a new OMPL state with coordinates q (flat order), SO2 parts wrapped.
-
-    Raises PlanningError if q does not have one finite number per coordinate.
-    """
+    """Return a new OMPL state with finite coordinates q (flat order), SO2 parts wrapped."""
     dof = len(wrapping_coordinates(space))
     values = np.array(q, dtype=np.float64)
     if values.shape != (dof,) or not np.isfinite(values).all():
@@ -180,9 +177,8 @@ class _Buffers(threading.local):
 class StateReader:
     """Copies OMPL states of one space into preallocated arrays.
 
-    `fast` says whether states are serialised straight into numpy memory (0.1 microseconds) or
-    read element by element. Buffers are per thread, because a kernel that releases the GIL
-    must not see its input overwritten.
+    `fast`: straight into numpy's memory (0.1 microseconds), not element by element. Buffers are
+    per thread: a kernel that releases the GIL must not see its input overwritten.
     """
 
     def __init__(self, space: Any, dof: int) -> None:
@@ -203,7 +199,7 @@ class StateReader:
         return self._copied(state, own.capsule_a, own.a)
 
     def read_pair(self, first: Any, second: Any) -> tuple[Configuration, Configuration]:
-        """Return both buffers of this thread, holding the two states."""
+        """Return both buffers of this thread, holding the states."""
         own = self._buffers
         a = self._copied(first, own.capsule_a, own.a)
         return a, self._copied(second, own.capsule_b, own.b)
@@ -234,10 +230,8 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
     """OMPL's question "is this state valid?", answered by a checker."""
 
     def __init__(self, si: Any, checker: CheckerLike) -> None:
-        """Attach `checker` to the space of `si` (one dimension per joint, flat order).
-
-        Raises PlanningError if dimensions differ or a part is neither RealVector nor SO2.
-        """
+        """Attach `checker` to the space of `si`; PlanningError if that has not one dimension
+        per joint, in flat order, or a part that is neither RealVector nor SO2."""
         super().__init__(si)
         self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
         self._clearance = checker.clearance
@@ -249,10 +243,7 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
         return self._asked()
 
     def isValid(self, state: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
-        """Return whether `state` is valid; exceptions of the checker propagate.
-
-        OMPL dispatches its longer overloads to this name too, hence `*unused`.
-        """
+        """Return whether `state` is valid; OMPL dispatches longer overloads here, too."""
         return self._ask(state)
 
     def clearance(self, state: Any, *unused: Any) -> float:
@@ -263,11 +254,10 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
 def _question(
     reader: StateReader, is_valid: Callable[[Any], bool]
 ) -> tuple[Callable[[Any], bool], Callable[[], int]]:
-    """Return a function that asks about a state, and one that says how often it was asked.
+    """A function that asks about a state, and one that says how often it was asked.
 
-    This runs for every state a planner samples. Names of a closure are found in half
-    the time of attributes, and comparing thread numbers costs less than thread-local
-    storage: the thread that made the checker has buffers of its own.
+    It runs for every state a planner samples. Names of a closure are found in half the time of
+    attributes, and comparing thread numbers costs less than thread-local storage.
     """
     asked = 0
     owner, buffer = get_ident(), np.zeros(len(reader.wraps))
@@ -306,10 +296,8 @@ class VPrismMotionValidator(ob.MotionValidator):
         self._any_wraps = bool(self._reader.wraps.any())
 
     def checkMotion(self, s1: Any, s2: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
-        """Return whether the straight motion from s1 to s2 is valid, both ends included.
-
-        RRT, RRTstar and KPIECE1 test no other state of the motion themselves.
-        """
+        """Return whether the straight motion is valid, both ends included (RRT, RRTstar and
+        KPIECE1 test no state of it themselves)."""
         self.checks += 1
         qa, qb = self._reader.read_pair(s1, s2)
         if not self._is_valid(qb):

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What becomes of a path that was found: shortened, made cheaper, resampled, verified.
 
-OMPL's `PathSimplifier` cuts accepted edges at points of its choice and keeps the
-pieces unchecked. A checker that samples at its finest step may refuse such a piece by
-microns, and the final verification then refuses the path. Here an edge enters the path
-only as it will be verified: same ends, same direction.
+OMPL's `PathSimplifier` cuts accepted edges and keeps the pieces unchecked, which a checker that
+samples at its finest step may refuse by microns. Here an edge enters the path only as it will
+be verified: same ends, same direction.
 """
 
 import logging
@@ -37,9 +36,9 @@ _MOVE_RANGE = (0.003, 0.6)  # Euclidean in joint space
 class MotionCheck:
     """Counts and answers `checker.check_motion` for edges that may become part of a path.
 
-    An edge that turns a continuous joint by half a turn or more is refused: it means what it
-    says, but others who follow the path could take it for the shorter way round. So is one
-    that leaves the joint limits, which not every checker knows.
+    Refused are also edges that turn a continuous joint by half a turn or more, which others
+    could take for the shorter way round, and those beyond the joint limits, which not every
+    checker knows.
     """
 
     def __init__(self, checker: CheckerLike) -> None:

@@ -53,12 +53,11 @@ def plan(
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
-    Start and goal are checked first. The path found is shortened, optionally resampled,
-    and then every edge of the returned array is checked again with
-    `checker.check_motion_report`. If the checker bounds the probability of collision
-    (`max_risk`), the whole path is then judged at once, by worlds the search has not seen;
-    a path that is too risky as a whole is searched for again under a tighter bound on its
-    edges, as long as the time limit allows. Exceptions raised by the checker propagate.
+    Start and goal are checked first. The path found is shortened, optionally resampled, and
+    then every edge of the returned array is checked again with `checker.check_motion_report`.
+    If the checker bounds the probability of collision (`max_risk`), the whole path is then
+    judged by worlds the search has not seen; one that is too risky is searched for again under
+    a tighter bound on its edges, within the time limit. Exceptions of the checker propagate.
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
@@ -67,33 +66,30 @@ def plan(
             pose (4, 4) of the end effector in the world frame (for a robot of four joints: if
             its last row is 0 0 0 1); or a `ReachRegion`. `report.refused_goals` says which
             were refused and why.
-        planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
-            BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
+        planner: one of `planners()`.
         time_limit: time for the search in seconds, more than 0; on `clock`. Preparing an
             objective (worlds drawn, the first time) counts; where it alone takes as long, the
             status is "timeout".
         seed: an integer from 0. The same seed gives the same path as long as the search
             ends by itself before the limit. OMPL's generator is global: this seeds it.
-        stop: when the optimising planners (RRTstar, InformedRRTstar, SORRTstar, BITstar,
-            AORRTC, PRMstar) stop: "limit", at the time limit (their path then depends on the
-            machine's speed); "first", at the first solution; "converged", when the cost
-            has settled. The others stop at their first solution in any case.
+        stop: when the planners that are `optimising` stop: "limit", at the time limit (their
+            path then depends on the machine's speed); "first", at the first solution;
+            "converged", when the cost has settled. The others stop at their first solution.
         convergence: for stop="converged": (tolerance, patience), stop when `patience`
             iterations have lowered the cost by less than the fraction `tolerance`.
         simplify: whether to shorten the path after the search.
         simplify_time: seconds after which no further round of shortening starts.
         step: length of the planner's steps in the metric of the space; OMPL's choice
             (a fifth of the space's extent) if None.
-        interpolate: largest distance between waypoints of the result, Euclidean in
-            joint space; no waypoints are added if None. An edge whose pieces do not all
-            pass the check by themselves stays whole.
+        interpolate: largest distance between waypoints of the result, Euclidean in joint space;
+            none are added if None, or to an edge whose pieces do not all pass by themselves.
         clearance_step: distance between the samples of the reported clearance.
         pose_goal: how a pose, or a region, is turned into configurations.
         second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
             the path is still handed out: the report and the message say so.
-        clock: what limits, and all times of the report, are measured by: "wall", or
-            "process", the processor time of this process, comparable on a busy machine (a
-            search that waits, as for a slow checker, ends after fifty times the limit).
+        clock: what limits and times of the report are measured by: "wall", or "process", the
+            processor time of this process, comparable on a busy machine (a search that waits,
+            as for a slow checker, ends after fifty times the limit).
         objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
             objective are accepted; shortening then never raises the cost, and afterwards
             waypoints are moved, within `simplify_time`, where that lowers it. A straight
@@ -103,10 +99,10 @@ def plan(
             their samples around the best path so far.
         margins: metres beyond the checker's own margin, decreasing, such as (0.02, 0.01,
             0.005, 0.0): with room to spare the path keeps away, in a narrow place it goes
-            through. The widest comes first, each with an equal share of the time that is left;
-            the first path is returned, and its `message` names the margin, or else the last
-            answer. Without 0 at the end, problems that only the checker's own margin allows
-            stay unsolved. The checker needs `with_extra_margin`.
+            through. The widest comes first, each with an equal share of the time that is left.
+            The first path is returned (its `message` names the margin), else the last answer.
+            Without 0 at the end, problems that only the checker's own margin allows stay
+            unsolved. The checker needs `with_extra_margin`.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.

@@ -89,10 +89,7 @@ def planner_kind(name: str) -> PlannerKind:
 
 
 def make_planner(kind: PlannerKind, si: Any, step: float | None) -> Any:
-    """Return a fresh planner.
-
-    Never reuse one: a second solve of AORRTC after clear() crashes the process.
-    """
+    """Return a fresh planner; a second solve of AORRTC after clear() crashes the process."""
     planner = kind.make(si)
     if step is not None:
         if not kind.has_range:
@@ -110,9 +107,8 @@ def make_planner(kind: PlannerKind, si: Any, step: float | None) -> Any:
 class SpaceLengthObjective(ob.OptimizationObjective):
     """Path length measured by the distance of the state space.
 
-    OMPL's own path length objective brings an informed sampler that exists for
-    RealVector, SE2 and SE3 only; on compound spaces BITstar, AORRTC and
-    InformedRRTstar raise with it. With this one they sample by rejection.
+    OMPL's own brings an informed sampler for RealVector, SE2 and SE3 only; on compound spaces
+    BITstar, AORRTC and InformedRRTstar raise with it. With this one they sample by rejection.
     """
 
     def __init__(self, si: Any) -> None:

@@ -242,12 +242,9 @@ def _solve(
 class _Progress:
     """A termination condition: the best cost has become noticeably better, or has settled.
 
-    Between two calls of `solve` the best path can be read; while it runs, it cannot. Calls
-    (one per iteration) and costs decide, not clocks: the same seed stops at the same ones.
-
-    Attributes:
-        settled: whether `patience` calls brought less than the relative `tolerance`, where
-            the request asks for that; a patience of 0 settles at the first solution.
+    The best path can be read only between two calls of `solve`. Calls (one per iteration) and
+    costs decide, not clocks: the same seed stops at the same ones. `settled`: `patience` calls
+    brought less than the relative `tolerance`, if that is asked for (0: at the first solution).
     """
 
     def __init__(self, planner: Any, request: SearchRequest, kind: PlannerKind) -> None:
@@ -279,8 +276,7 @@ class _Progress:
 
 
 def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoints:
-    """Copy a path to numpy, wrapping coordinates continued from row to row, from the start's
-    own turns on."""
+    """Copy a path to numpy, wrapping coordinates continued from the start's own turns on."""
     rows = [start]
     for state in path.getStates()[1:]:
         rows.append(nearest_turns(reader.read(state).copy(), rows[-1], reader.wraps))
@@ -290,9 +286,9 @@ def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoint
 class _HeldErrors:
     """A checker whose first exception waits until the search is over.
 
-    PRM and PRMstar run a second C++ thread. An exception that leaves `solve` destroys it
-    unjoined, and the process ends with `std::terminate`. So the first one is held back, later
-    questions are answered "invalid", the search is told to stop, and `solve` raises it again.
+    PRM and PRMstar run a second C++ thread, which an exception that leaves `solve` destroys
+    unjoined: the process ends with `std::terminate`. So the first one is held back, later
+    questions are answered "invalid", the search is stopped, and `solve` raises it again.
     """
 
     def __init__(self, checker: CheckerLike) -> None:

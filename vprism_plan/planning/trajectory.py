@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a verified path to a timed trajectory that never leaves it.
 
-The checker certified straight lines in joint space. Blending corners would leave them,
-so the motion stops where the direction changes, and nowhere else. Between stops all
-joints share one trapezoidal profile along the line.
-
-Files hold `trajectory_msgs/JointTrajectory` in JSON.
+The checker certified straight lines in joint space. Blending corners would leave them, so the
+motion stops where the direction changes, and nowhere else. Between stops all joints share one
+trapezoidal profile along the line. Files hold `trajectory_msgs/JointTrajectory` in JSON.
 """
 
 import json
@@ -36,9 +34,8 @@ _NANOSECONDS = 10**9
 class Trajectory:
     """A motion over time, as cubic pieces.
 
-    Every change of acceleration is a point, so cubic interpolation of positions and
-    velocities, which is what trajectory controllers do when they are given no
-    accelerations, reproduces the trapezoidal profile exactly and stays on the path.
+    Every change of acceleration is a point, so cubic interpolation of positions and velocities,
+    as controllers do without accelerations, is the trapezoidal profile and stays on the path.
 
     Attributes:
         times: (n,) seconds from the start, increasing, the first is 0.
@@ -159,7 +156,7 @@ def _timed(
     total = cruise + 2.0 * ramp
 
     def profile(t: float) -> tuple[float, float]:
-        """Return s and s' of the trapezoid at time t."""
+        """s and s' of the trapezoid at time t."""
         if t <= ramp:
             return 0.5 * rate * t * t, rate * t
         if t < total - ramp:
@@ -168,7 +165,7 @@ def _timed(
         return 1.0 - 0.5 * rate * left * left, rate * left
 
     def time_at(s: float) -> float:
-        """Return the time at which the trapezoid reaches s."""
+        """Time at which the trapezoid reaches s."""
         if s <= 0.5 * top * ramp:
             return math.sqrt(2.0 * s / rate)
         if s <= 1.0 - 0.5 * top * ramp:
