@@ -71,17 +71,23 @@ def _run(command: Command) -> int:
     _check(command)
     kinds = SETS if command.set == "all" else (command.set,)
     scenes = _SCENES.get(command.table, 100) if command.scenes is None else command.scenes
-    root = _checkout()
+    root = Path(__file__).resolve().parents[1]
     store = root / "build" / "evaluation" if command.store is None else command.store
     output = root / "docs" / "results" if command.output is None else command.output
     require_writable(output)
     if command.output is None:
-        _keep_larger(output / f"{command.table}.json", _total(command.table, kinds, scenes))
-    own = {"planning": _planning, "uncertainty": _uncertainty}
+        total = scenes if command.table == "planning" else scenes * len(kinds)
+        _keep_larger(output / f"{command.table}.json", total)
+    runs = {"planning": _planning, "uncertainty": _uncertainty}
+    own = command.table if command.table in runs else "reconstruction"
+    asked = {
+        "kinds": kinds, "scenes": scenes, "first_seed": command.first_seed, "data": command.data,
+        "store": store / own, "output": output, "command": command_line(command),
+        "jobs": command.jobs, "backend": command.backend, "cluster": command.cluster,
+    }  # fmt: skip
     with _log_lines():
-        payload, lines, files = own.get(command.table, _reconstruction)(
-            command, kinds, scenes, store, output
-        )
+        run = runs.get(command.table, _reconstruction)
+        payload, lines, files = run(command.table, command.methods, asked)
     payload = {
         "table": command.table, "sets": list(kinds), "scenes": scenes,
         "first_seed": command.first_seed, "command": command_line(command), **payload,
@@ -102,11 +108,6 @@ def _check(command: Command) -> None:
         raise ConfigError(f"--first-seed is {command.first_seed}; it must be at least 0")
     if command.cluster is not None and command.backend == "loky":
         raise ConfigError("--cluster needs --backend dask or ray; loky runs on this machine")
-
-
-def _total(table: str, kinds: tuple[str, ...], scenes: int) -> int:
-    """Return the scenes of all sets together."""
-    return scenes if table == "planning" else scenes * len(kinds)
 
 
 def _keep_larger(file: Path, scenes: int) -> None:
@@ -130,11 +131,6 @@ def _keep_larger(file: Path, scenes: int) -> None:
             f"{file} is of {there} scenes and would be replaced by a report of {scenes}; ask for "
             "as many, or name another folder by --output"
         )
-
-
-def _checkout() -> Path:
-    """Return the checkout that this runs from."""
-    return Path(__file__).resolve().parents[1]
 
 
 def command_line(command: Command) -> str:
@@ -175,18 +171,11 @@ def _log_lines() -> Iterator[None]:
 Report = tuple[dict[str, Any], list[str], list[Path]]
 
 
-def _reconstruction(
-    command: Command, kinds: tuple[str, ...], scenes: int, store: Path, output: Path
-) -> Report:
+def _reconstruction(table: str, methods: Sequence[str], asked: dict[str, Any]) -> Report:
     """Run one of the tables of reconstruction."""
     from experiments.tables.reconstruction import run
 
-    results, files = run(
-        command.table, kinds=kinds, scenes=scenes, first_seed=command.first_seed,
-        methods=command.methods, data=command.data, store=store / "reconstruction",
-        output=output, jobs=command.jobs, backend=command.backend, cluster=command.cluster,
-        command=command_line(command),
-    )  # fmt: skip
+    results, files = run(table, methods=methods, **asked)
     claims = [
         {"claim": text, "set": kind, **verdict.to_dict()}
         for text, verdicts in results.verdicts.items()
@@ -208,17 +197,11 @@ def _reconstruction(
     return {"means": means, "claims": claims}, lines, files
 
 
-def _planning(
-    command: Command, kinds: tuple[str, ...], scenes: int, store: Path, output: Path
-) -> Report:
-    """Run the planning benchmark; `scenes` are shared out among the sets."""
+def _planning(_: str, checkers: Sequence[str], asked: dict[str, Any]) -> Report:
+    """Run the planning benchmark; scenes are shared out among the sets."""
     from experiments.planning_benchmark.report import benchmark
 
-    figures, files = benchmark(
-        kinds, scenes, command.first_seed, checkers=command.methods or None, data=command.data,
-        store=store / "planning", output=output, jobs=command.jobs, backend=command.backend,
-        cluster=command.cluster, command=command_line(command),
-    )  # fmt: skip
+    figures, files = benchmark(checkers=checkers or None, **asked)
     lines = [
         f"{key}: success {row['success']['value']:.3f}, true collisions "
         f"{row['collision']['value'] if row['collision']['value'] is not None else math.nan:.3f}"
@@ -227,17 +210,11 @@ def _planning(
     return {"contenders": figures["contenders"], "claims": figures["statements"]}, lines, files
 
 
-def _uncertainty(
-    command: Command, kinds: tuple[str, ...], scenes: int, store: Path, output: Path
-) -> Report:
+def _uncertainty(_: str, __: Sequence[str], asked: dict[str, Any]) -> Report:
     """Compare V-PRISM's uncertainty with a point estimate's."""
     from experiments.tables.uncertainty import run
 
-    figures, files = run(
-        kinds, scenes, command.first_seed, data=command.data, store=store / "uncertainty",
-        output=output, jobs=command.jobs, backend=command.backend, cluster=command.cluster,
-        command=command_line(command),
-    )  # fmt: skip
+    figures, files = run(**asked)
     return {"figures": figures}, [], files
 
 

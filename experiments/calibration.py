@@ -6,12 +6,12 @@ would be a mean over mostly visible, easy points.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from experiments.metrics import Reliability, object_iou
+from experiments.stored import Stored
 from vprism_plan.mapping import MapConfig, VPrismMap, fit_map
 from vprism_plan.simulation.scenes import Scene, hidden_object_scene, random_scene
 from vprism_plan.world import WorldConfig
@@ -34,7 +34,7 @@ def calibration_scene(seed: int) -> Scene:
 
 
 @dataclass(frozen=True)
-class VoxelCalibration:
+class VoxelCalibration(Stored):
     """What a map says of the voxels of one or more scenes, against the truth.
 
     Attributes:
@@ -83,27 +83,6 @@ class VoxelCalibration:
             sum(scene.true_supported for scene in scenes),
             tuple(count for scene in scenes for count in scene.hinge_points),
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON; `from_dict` reads it back exactly."""
-        return {
-            "parts": [part.to_dict() for part in self.parts],
-            "ious": list(self.ious),
-            "found": self.found,
-            "true": self.true,
-            "found_supported": self.found_supported,
-            "true_supported": self.true_supported,
-            "hinge_points": list(self.hinge_points),
-        }
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "VoxelCalibration":
-        """Rebuild from `to_dict`."""
-        visible, supported, unsupported = (Reliability.from_dict(part) for part in data["parts"])
-        return cls(
-            (visible, supported, unsupported), tuple(data["ious"]), data["found"], data["true"],
-            data["found_supported"], data["true_supported"], tuple(data["hinge_points"]),
-        )  # fmt: skip
 
 
 def evaluation_points(scene: Scene, spacing: float) -> Float[np.ndarray, "n 3"]:

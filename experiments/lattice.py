@@ -13,8 +13,7 @@ from jaxtyping import Float
 from experiments.path_calibration import inside_sweep, swept_voxels
 from vprism_plan.mapping import MapConfig, VPrismMap, fit_map
 from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.placement import upright
-from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.scenes import Scene, upright
 from vprism_plan.simulation.solids import sphere
 from vprism_plan.world import PosteriorWorlds
 

@@ -3,11 +3,11 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from experiments.stored import Stored
 from vprism_plan.collision.risk import clopper_pearson
 from vprism_plan.errors import ConfigError
 
@@ -31,7 +31,7 @@ class ReliabilityBin:
 
 
 @dataclass(frozen=True)
-class Reliability:
+class Reliability(Stored):
     """Predicted probabilities against outcomes, in bins of equal width.
 
     Bin b of B holds b / B <= p < (b + 1) / B, the last one also p = 1. Tables of separate
@@ -130,37 +130,6 @@ class Reliability:
                     )
                 )  # fmt: skip
         return tuple(found)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the sums, ready for JSON; `from_dict` reads them back exactly."""
-        return {
-            "counts": list(self.counts),
-            "predicted": list(self.predicted),
-            "positives": list(self.positives),
-            "squared_error": self.squared_error,
-        }
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Reliability":
-        """Rebuild a table from `to_dict`."""
-        return cls(
-            tuple(data["counts"]),
-            tuple(data["predicted"]),
-            tuple(data["positives"]),
-            data["squared_error"],
-        )
-
-
-def brier_score(probability: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"]) -> float:
-    """Return the mean squared difference of predictions (n,) and outcomes (n,)."""
-    return Reliability.of(probability, happened, 1).brier
-
-
-def expected_calibration_error(
-    probability: Float[np.ndarray, " n"], happened: Bool[np.ndarray, " n"], bins: int = 10
-) -> float:
-    """Return the expected calibration error over bins of equal width (see `Reliability.ece`)."""
-    return Reliability.of(probability, happened, bins).ece
 
 
 def object_iou(

@@ -2,13 +2,13 @@
 """Is the joint collision probability of a path true? Swept balls against known solids."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.calibration import UNSUPPORTED, knowledge
 from experiments.metrics import Reliability
+from experiments.stored import Stored
 from vprism_plan.collision.risk import clopper_pearson
 from vprism_plan.mapping import VPrismMap
 from vprism_plan.simulation.scenes import Scene
@@ -20,7 +20,7 @@ _FINE = 0.002  # metres between the places where a path is compared with the tru
 
 
 @dataclass(frozen=True)
-class PathCase:
+class PathCase(Stored):
     """One path: how many of the worlds object to it, and what the solids say.
 
     Attributes:
@@ -42,7 +42,7 @@ class PathCase:
 
 
 @dataclass(frozen=True)
-class PathCalibration:
+class PathCalibration(Stored):
     """Joint collision probabilities of many paths against what really happens."""
 
     cases: tuple[PathCase, ...]
@@ -68,15 +68,6 @@ class PathCalibration:
             safe += upper < bound
             collided += upper < bound and case.distance < 0.0
         return int(safe), int(collided)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return {"cases": [vars(case) for case in self.cases]}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "PathCalibration":
-        """Rebuild from `to_dict`."""
-        return cls(tuple(PathCase(**case) for case in data["cases"]))
 
 
 def random_sweeps(scene: Scene, n: int, seed: int) -> Float[np.ndarray, "n 2 3"]:

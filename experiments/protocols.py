@@ -3,16 +3,29 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from vprism_plan.errors import VPrismError
 from vprism_plan.perception.observation import Observation
 from vprism_plan.simulation.camera import Camera
 
 if TYPE_CHECKING:
     import trimesh
+
+
+def checked_points(points: Any, error: type[VPrismError]) -> Float[np.ndarray, "n 3"]:
+    """Return points as finite float64 (n, 3), metres, or raise `error`."""
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise error(f"points have shape {array.shape}; they must be (n, 3), world, in m")
+    finite = np.isfinite(array).all(axis=1)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise error(f"point {row} is {array[row].tolist()}; coordinates must be finite")
+    return array
 
 
 class TrueScene(Protocol):

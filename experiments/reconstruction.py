@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from experiments.metrics import Reliability
 from experiments.protocols import Reconstruction, TrueScene
 from experiments.scene_truth import PARTS, NodeUnion, SceneTruth, surface_points
+from experiments.stored import Stored
 from vprism_plan.errors import ConfigError
 from vprism_plan.world.config import check_level
 
@@ -32,7 +33,7 @@ VOXEL_SPACING, VOXEL_SHIFT = 0.005, 0.5
 
 
 @dataclass(frozen=True)
-class ObjectScore:
+class ObjectScore(Stored):
     """One object of one scene.
 
     Attributes:
@@ -60,7 +61,7 @@ class ObjectScore:
 
 
 @dataclass(frozen=True)
-class ReconstructionScores:
+class ReconstructionScores(Stored):
     """What a method made of one or more scenes.
 
     Attributes:
@@ -108,31 +109,6 @@ class ReconstructionScores:
             tuple(Reliability.merged(s.parts[k] for s in scenes) for k in range(len(PARTS))),
             tuple(sum(s.entropy[k] for s in scenes) for k in range(len(PARTS))),
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON (a lost object's Chamfer is null)."""
-        return {
-            "objects": [
-                {
-                    "object_id": o.object_id, "pixels": o.pixels, "intersection": o.intersection,
-                    "union": o.union, "chamfer": None if o.lost else o.chamfer,
-                }
-                for o in self.objects
-            ],
-            "hidden": self.hidden,
-            "parts": [part.to_dict() for part in self.parts],
-            "entropy": list(self.entropy),
-        }  # fmt: skip
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "ReconstructionScores":
-        """Rebuild from `to_dict`."""
-        objects = tuple(
-            ObjectScore(**{**o, "chamfer": math.nan if o["chamfer"] is None else o["chamfer"]})
-            for o in data["objects"]
-        )
-        parts = tuple(Reliability.from_dict(part) for part in data["parts"])
-        return cls(objects, data["hidden"], parts, tuple(data["entropy"]))
 
 
 def evaluate_reconstruction(

@@ -39,19 +39,20 @@ def number(
     *,
     above: bool = False,
     below: bool = False,
+    finite: bool = True,
     error: type[VPrismError] = ConfigError,
 ) -> float:
-    """Return a finite number from `low` to `high`, or strictly above or below them."""
+    """Return a number from `low` to `high`, or strictly above or below them."""
     if is_number(value):
         given = float(value)
         inside = (low < given if above else low <= given) and (
             given < high if below else given <= high
         )
-        if inside and abs(given) != inf:
+        if inside and not (finite and abs(given) == inf):
             return given
     ends = [f"{'above' if above else 'at least'} {low:g}"] if low > -inf else []
     ends += [f"{'below' if below else 'at most'} {high:g}"] if high < inf else []
-    wanted = f"a finite number {' and '.join(ends)} {unit}".strip()
+    wanted = f"a {'finite ' * finite}number {' and '.join(ends)} {unit}".strip()
     raise error(f"{name} is {value!r}; it must be {wanted}")
 
 
@@ -66,7 +67,7 @@ def whole(
     """Return a whole number from `low` to `high`."""
     if is_whole(value) and low <= value <= high:
         return int(value)
-    most = f" and at most {high:g}" if high < inf else ""
+    most = f" and at most {high}" if high < inf else ""
     raise error(f"{name} is {value!r}; it must be a whole number, at least {low}{most}")
 
 

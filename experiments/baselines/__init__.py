@@ -6,43 +6,34 @@ A method's code, and whatever heavy package it needs, is imported when it first 
 
 from functools import partial
 from importlib import import_module
+from typing import Any
 
 from experiments.protocols import Method, Reconstruction
 from vprism_plan.errors import ConfigError
 from vprism_plan.perception.observation import Observation
 
 
-def _fit(module: str, function: str, observation: Observation, seed: int) -> Reconstruction:
-    found: Reconstruction = getattr(import_module(f"{__name__}.{module}"), function)(
-        observation, seed
-    )
+def _fit(module: str, extra: dict[str, str], observation: Observation, seed: int) -> Reconstruction:
+    fit = import_module(f"{__name__}.{module}").fit
+    found: Reconstruction = fit(observation, seed, **extra)
     return found
 
 
-def _method(key: str, label: str, module: str, function: str = "fit", **kwargs: object) -> Method:
+def _method(key: str, label: str, module: str | None = None, **kwargs: Any) -> Method:
+    extra = {"preset": key} if module is None else {}
     # A partial of a module's function, unlike a closure, can be sent to another process.
-    return Method(key, label, partial(_fit, module, function), **kwargs)  # type: ignore[arg-type]
+    return Method(key, label, partial(_fit, module or "maps", extra), **kwargs)
 
 
 METHODS: dict[str, Method] = {
     entry.key: entry
     for entry in (
-        _method("vprism", "V-PRISM (ours)", "maps", "fit_default"),
-        _method("vprism-fine", "V-PRISM (ours, fine)", "maps", "fit_fine"),
-        _method("vprism-paper", "V-PRISM (paper)", "maps", "fit_paper"),
-        _method("bhm-sampling", "V-PRISM (paper) with BHM sampling", "maps", "fit_bhm_sampling"),
-        _method(
-            "no-under-table",
-            "V-PRISM (paper) without under the table",
-            "maps",
-            "fit_no_under_table",
-        ),
-        _method(
-            "no-stratified",
-            "V-PRISM (paper) without stratified sampling",
-            "maps",
-            "fit_no_stratified",
-        ),
+        _method("vprism", "V-PRISM (ours)"),
+        _method("vprism-fine", "V-PRISM (ours, fine)"),
+        _method("vprism-paper", "V-PRISM (paper)"),
+        _method("bhm-sampling", "V-PRISM (paper) with BHM sampling"),
+        _method("no-under-table", "V-PRISM (paper) without under the table"),
+        _method("no-stratified", "V-PRISM (paper) without stratified sampling"),
         _method("sigmoid", "Sigmoid maps, one per object", "sigmoid"),
         _method("sgd", "Point estimate (SGD)", "sgd", uncertainty=False),
         _method("voxel", "Voxel", "voxel", continuous=False, uncertainty=False),
@@ -57,6 +48,3 @@ def method(key: str) -> Method:
     if key not in METHODS:
         raise ConfigError(f"there is no method {key!r}; valid: {', '.join(METHODS)}")
     return METHODS[key]
-
-
-__all__ = ["METHODS", "method"]

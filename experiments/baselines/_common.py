@@ -1,22 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What several baselines share."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float, Int
-
-from vprism_plan.errors import MapError
-
-
-def checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
-    """Return points as finite float64 (n, 3), metres; MapError otherwise."""
-    array = np.ascontiguousarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise MapError(f"points have shape {array.shape}; they must be (N, 3), world, in m")
-    if not np.isfinite(array).all():
-        raise MapError("points hold NaN or infinity; every coordinate must be finite (m)")
-    return array
 
 
 def one_hot(classes: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, "n k"]:

@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, Int64, UInt8
 
-from experiments.baselines._common import checked_points
-from vprism_plan.errors import MissingDependencyError
+from experiments.protocols import checked_points
+from vprism_plan.errors import MapError, MissingDependencyError
 from vprism_plan.perception.observation import Observation
 
 if TYPE_CHECKING:
     import pyoctomap
 
 CELL = 0.01  # metres
-REACH = 0.25  # metres around the objects' points in which `support_bounds` looks for surfaces
 _PARTS = 2  # of the image, along rows and along columns
 _UNKNOWN = float(np.nextafter(0.5, 0.0))  # no evidence, which is not the half that counts
 
@@ -38,7 +37,6 @@ class OctoMapReconstruction:
         cell: edge of the finest cells, m.
         keys: (c,) cells that hold observed points, one number each, sorted.
         classes: (c,) what most of their points show; 0 is background, such as the table.
-        lower, upper: corners of a box around the objects, m.
     """
 
     object_ids: tuple[int, ...]
@@ -46,8 +44,6 @@ class OctoMapReconstruction:
     cell: float
     keys: Int64[np.ndarray, " c"]
     classes: Int64[np.ndarray, " c"]
-    lower: Float[np.ndarray, " 3"]
-    upper: Float[np.ndarray, " 3"]
 
     def state(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
         """Return FREE (0), OCCUPIED (1) or UNKNOWN (2) at each point (n, 3) m.
@@ -60,7 +56,7 @@ class OctoMapReconstruction:
 
     def occupancy(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Return the tree's probability of "occupied" at points (n, 3) m; NaN where unknown."""
-        shifted = checked_points(points) + 0.5 * self.cell
+        shifted = checked_points(points, MapError) + 0.5 * self.cell
         index, inverse = np.unique(
             np.floor(shifted / self.cell).astype(np.int64), axis=0, return_inverse=True
         )
@@ -78,7 +74,7 @@ class OctoMapReconstruction:
         the table is certainly no object. Free and unknown cells (0.5, or rather just
         under it) share their probability among all objects.
         """
-        points = checked_points(points)
+        points = checked_points(points, MapError)
         occupancy = self.occupancy(points)
         objects = len(self.object_ids)
         occupied = np.where(np.isnan(occupancy), _UNKNOWN, occupancy)
@@ -92,10 +88,6 @@ class OctoMapReconstruction:
         rows[:, 0] = 1.0 - occupied
         rows[hit[~own], 0] = 1.0
         return rows
-
-    def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """Return the corners (m) of the box around the objects."""
-        return self.lower.copy(), self.upper.copy()
 
     def _shown(self, points: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
         """Class that most observed points in each point's cell show, 0 without any."""
@@ -128,11 +120,8 @@ def fit(observation: Observation, seed: int, cell: float = CELL) -> OctoMapRecon
         tree.insertPointCloud(cloud, observation.camera_center + 0.5 * cell, lazy_eval=True)
     tree.updateInnerOccupancy()
     points, labels = observation.points()
-    own = points[labels > 0]
     keys, classes = _majority(points, np.searchsorted((0, *object_ids), labels), cell)
-    return OctoMapReconstruction(
-        object_ids, tree, cell, keys, classes, own.min(axis=0) - REACH, own.max(axis=0) + REACH
-    )
+    return OctoMapReconstruction(object_ids, tree, cell, keys, classes)
 
 
 def _keys(points: Float[np.ndarray, "n 3"], cell: float) -> Int64[np.ndarray, " n"]:

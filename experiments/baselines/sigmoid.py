@@ -42,10 +42,6 @@ class SigmoidMaps:
         own = np.stack([one.predict_proba(points)[:, 1] for one in self.maps], axis=1)
         return np.column_stack([np.prod(1.0 - own, axis=1), own])
 
-    def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """Return the corners (m) of a box outside which no hinge reaches."""
-        return self.maps[0].support_bounds()
-
 
 def fit(observation: Observation, seed: int, config: MapConfig | None = None) -> SigmoidMaps:
     """Fit a binary map to every object; errors are those of `fit_map`.

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from experiments.baselines._common import checked_points, counts_per_voxel, one_hot
+from experiments.baselines._common import counts_per_voxel, one_hot
+from experiments.protocols import checked_points
 from vprism_plan._kernels import rays
+from vprism_plan.errors import MapError
 from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
@@ -40,18 +42,13 @@ class VoxelReconstruction:
 
     def predict_proba(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
         """Return 1 for the class of each point's (m) voxel, 0 for the others: (n, K)."""
-        points = checked_points(points)
+        points = checked_points(points, MapError)
         index = np.round(points / self.edge).astype(np.int64) - self.first
         inside = ((index >= 0) & (index < self.classes.shape)).all(axis=1)
         inside &= self.plane.signed_distance(points) >= 0.0
         found = np.zeros(len(points), dtype=np.int64)
         found[inside] = self.classes[tuple(index[inside].T)]
         return one_hot(found, len(self.object_ids) + 1)
-
-    def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """Return the corners (m) of the grid."""
-        lower = self.edge * (self.first - 0.5)
-        return lower, lower + self.edge * np.array(self.classes.shape)
 
 
 def fit(observation: Observation, seed: int, edge: float = VOXEL) -> VoxelReconstruction:

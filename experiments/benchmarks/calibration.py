@@ -19,12 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.calibration import (
-    PARTS,
-    VoxelCalibration,
-    calibration_scene,
-    evaluate_voxels,
-)
+from experiments.calibration import PARTS, VoxelCalibration, calibration_scene, evaluate_voxels
 from experiments.metrics import Reliability, ReliabilityBin
 from experiments.path_calibration import PathCalibration, evaluate_paths
 from experiments.tables.intervals import over_scenes

@@ -6,29 +6,16 @@ python -m experiments.benchmarks.checking
 Everything is timed in one run, in turns, and the ratios of the medians are printed.
 """
 
-import time
-from pathlib import Path
-
 import fcl
 import numpy as np
 
 import vprism_plan as vp
+from experiments.benchmarks._common import demo_checker, in_turns
 from vprism_plan._kernels import checking as kernels
 
 ROUNDS = 15
 CONFIGURATIONS = 1000
 FCL_CONFIGURATIONS = 60
-
-
-def demo_checker() -> vp.CollisionChecker:
-    """The bundled scene with a Panda beside the clutter."""
-    observation = vp.load_observation(Path(vp.__file__).parent / "data" / "demo_scene")
-    world = vp.World(vp.fit_map(observation))
-    base = np.eye(4)
-    base[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    base[:3, 3] = [0.05, -0.6, 0.0]
-    urdf = Path(__file__).parents[2] / "urdf" / "panda.urdf"
-    return vp.CollisionChecker(world, vp.Robot.from_urdf(urdf, base_pose=base))
 
 
 class FclSpheres:
@@ -66,17 +53,6 @@ class FclSpheres:
         return True
 
 
-def median_us(calls: dict, n: dict) -> dict:
-    """Median time per configuration of each call, taken in turns, microseconds."""
-    times = {name: [] for name in calls}
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            times[name].append((time.perf_counter() - start) / n[name] * 1e6)
-    return {name: float(np.median(t)) for name, t in times.items()}
-
-
 def main() -> None:
     checker = demo_checker()
     robot = checker.robot
@@ -98,8 +74,8 @@ def main() -> None:
     }
     n = dict.fromkeys(calls, CONFIGURATIONS)
     n["clearance, free"] = n["python-fcl, free"] = FCL_CONFIGURATIONS
-    median_us(calls, n)  # warm up
-    result = median_us(calls, n)
+    took = in_turns(calls, ROUNDS)
+    result = {name: 1e6 * float(np.median(t)) / n[name] for name, t in took.items()}
     print(
         f"Panda, {len(robot.sphere_radii)} spheres, {len(robot.collision_pairs)} link pairs; "
         f"{checker.world.field.distance.size} nodes; FCL meshes of {peer.faces} faces; "

@@ -41,7 +41,7 @@ def error(robot: vp.Robot, link: str, q: np.ndarray, pose: np.ndarray) -> tuple[
 def ours(robot: vp.Robot, link: str, pose: np.ndarray, seed: int) -> np.ndarray:
     config = PoseGoalConfig(link=link, attempts=RESTARTS)
     reference = robot.random_configuration(np.random.default_rng(seed))
-    return solve_pose(robot, pose, reference, seed, config).reached
+    return solve_pose(robot, pose, reference, seed, config)
 
 
 def theirs(robot: vp.Robot, link: str, name: str):

@@ -11,7 +11,7 @@ import time
 import numpy as np
 
 import vprism_plan as vp
-from experiments.benchmarks.checking import demo_checker
+from experiments.benchmarks._common import demo_checker, in_turns
 from vprism_plan.collision import compare
 
 ROUNDS = 7
@@ -24,15 +24,6 @@ def timed(call) -> tuple[float, object]:
     start = time.perf_counter()
     result = call()
     return time.perf_counter() - start, result
-
-
-def median_us(calls: dict) -> dict:
-    """Median time per configuration of each call, taken in turns, microseconds."""
-    times = {name: [] for name in calls}
-    for _ in range(ROUNDS):
-        for name, call in calls.items():
-            times[name].append(timed(call)[0] / CONFIGURATIONS * 1e6)
-    return {name: float(np.median(t)) for name, t in times.items()}
 
 
 def main() -> None:
@@ -57,8 +48,8 @@ def main() -> None:
     for name, judge in meshes.items():
         calls[f"{name}: is_valid"] = lambda j=judge: [j.is_valid(q) for q in near]
         calls[f"{name}: clearance"] = lambda j=judge: [j.clearance(q) for q in near]
-    median_us(calls)  # warm up
-    result = median_us(calls)
+    took = in_turns(calls, ROUNDS)
+    result = {name: 1e6 * float(np.median(t)) / CONFIGURATIONS for name, t in took.items()}
     print(f"Panda in the demo scene, {CONFIGURATIONS} free configurations near obstacles")
     for name, judge in meshes.items():
         faces = sum(len(mesh.faces) for mesh in judge.surfaces.meshes.values())

@@ -8,7 +8,6 @@ Ratios are taken within this one run: absolute times depend on the machine.
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 from ompl import base as ob
 
 import vprism_plan as vp
+from experiments.benchmarks._common import GOAL, START, demo_checker, in_turns
 from vprism_plan.planning import (
     VPrismMotionValidator,
     VPrismStateValidityChecker,
@@ -25,9 +25,6 @@ from vprism_plan.planning import (
     to_state,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
-START = np.array([0.5, 0.67, 0.0, -1.6, 0.0, 2.27, 0.785])
-GOAL = np.array([-0.35, 0.3, 0.0, -1.85, 0.0, 2.15, 0.785])
 ROUNDS, STATES = 15, 2000
 
 
@@ -36,18 +33,6 @@ class EmptyCallback(ob.StateValidityChecker):
 
     def isValid(self, state: ob.State) -> bool:  # noqa: N802
         return True
-
-
-def demo_checker(map_file: Path | None) -> vp.CollisionChecker:
-    if map_file is not None:
-        fitted = vp.load_map(map_file)
-    else:
-        fitted = vp.fit_map(vp.load_observation(ROOT / "vprism_plan" / "data" / "demo_scene"))
-    base = np.eye(4)
-    base[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    base[:3, 3] = [0.05, -0.6, 0.0]
-    robot = vp.Robot.from_urdf(ROOT / "urdf" / "panda.urdf", base_pose=base)
-    return vp.CollisionChecker(vp.World(fitted), robot)
 
 
 def spaces(checker: vp.CollisionChecker) -> tuple[ob.SpaceInformation, ob.SpaceInformation]:
@@ -61,17 +46,6 @@ def spaces(checker: vp.CollisionChecker) -> tuple[ob.SpaceInformation, ob.SpaceI
         ours.setup()
         empty.setup()
     return ours, empty
-
-
-def alternate(*tasks: Callable[[], object]) -> list[float]:
-    """Best seconds of each task; they take turns, so a busy machine hits all alike."""
-    best = [np.inf] * len(tasks)
-    for _ in range(ROUNDS):
-        for i, task in enumerate(tasks):
-            began = time.perf_counter()
-            task()
-            best[i] = min(best[i], time.perf_counter() - began)
-    return best
 
 
 def callbacks(checker: vp.CollisionChecker) -> None:
@@ -92,11 +66,12 @@ def callbacks(checker: vp.CollisionChecker) -> None:
         rows = [np.ascontiguousarray(q) for q in configurations]
         a = [to_state(ours.getStateSpace(), q) for q in rows]
         b = [to_state(empty.getStateSpace(), q) for q in rows]
-        asked, nothing, alone = alternate(
-            lambda a=a: [ours.isValid(state) for state in a],
-            lambda b=b: [empty.isValid(state) for state in b],
-            lambda rows=rows: [checker.is_valid_buffer(q) for q in rows],
-        )
+        tasks = {
+            "asked": lambda a=a: [ours.isValid(state) for state in a],
+            "nothing": lambda b=b: [empty.isValid(state) for state in b],
+            "alone": lambda rows=rows: [checker.is_valid_buffer(q) for q in rows],
+        }
+        asked, nothing, alone = (own.min() for own in in_turns(tasks, ROUNDS).values())
         scale = 1e6 / len(rows)
         print(
             f"  {name:38s} {scale * asked:6.2f} / {scale * nothing:5.2f} = "

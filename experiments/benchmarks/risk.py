@@ -8,45 +8,25 @@ Everything is timed in one run, in turns; medians of the rounds, ratios of the m
 
 import time
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
 import vprism_plan as vp
-from experiments.benchmarks.checking import demo_checker
+from experiments.benchmarks._common import DEMO, GOAL, START, demo_checker, in_turns
 
 ROUNDS = 15
 CONFIGURATIONS = 500
-START = np.array([0.5, 0.67, 0.0, -1.6, 0.0, 2.27, 0.785])
-GOAL = np.array([-0.35, 0.3, 0.0, -1.85, 0.0, 2.15, 0.785])
 
 
-def seconds(work: Callable[[], object]) -> float:
-    """Wall time of one call."""
-    began = time.perf_counter()
-    work()
-    return time.perf_counter() - began
+def each(ask: Callable[[np.ndarray], object], rows: np.ndarray) -> None:
+    for q in rows:
+        ask(q)
 
 
-def each(ask: Callable[[np.ndarray], object], rows: np.ndarray) -> Callable[[], None]:
-    """A round: ask about every row."""
-
-    def work() -> None:
-        for q in rows:
-            ask(q)
-
-    return work
-
-
-def in_turns(works: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Median seconds of each, over rounds in which they take turns."""
-    for work in works.values():
-        work()
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(ROUNDS):
-        for name, work in works.items():
-            times[name].append(seconds(work))
-    return {name: float(np.median(values)) for name, values in times.items()}
+def medians(tasks: dict[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
+    """Median seconds of each task."""
+    return {name: float(np.median(took)) for name, took in in_turns(tasks, rounds).items()}
 
 
 def configurations(checker: vp.CollisionChecker) -> dict[str, np.ndarray]:
@@ -63,13 +43,12 @@ def configurations(checker: vp.CollisionChecker) -> dict[str, np.ndarray]:
 def per_configuration(checker: vp.CollisionChecker, bounded: vp.CollisionChecker) -> None:
     """One configuration: yes or no, yes or no by worlds, and the probability itself."""
     for name, rows in configurations(checker).items():
-        took = in_turns(
-            {
-                "is_valid": each(checker.is_valid, rows),
-                "is_valid with max_risk": each(bounded.is_valid, rows),
-                "collision_probability": each(checker.collision_probability, rows),
-            }
-        )
+        asks = {
+            "is_valid": checker.is_valid,
+            "is_valid with max_risk": bounded.is_valid,
+            "collision_probability": checker.collision_probability,
+        }
+        took = medians({k: partial(each, ask, rows) for k, ask in asks.items()})
         base = took["is_valid"]
         print(f"{name} ({len(rows)} configurations):")
         for what, value in took.items():
@@ -86,8 +65,10 @@ def per_path(checker: vp.CollisionChecker, bounded: vp.CollisionChecker) -> None
         at = np.linspace(0.0, len(corners) - 1.0, 100)
         path = np.stack([np.interp(at, range(len(corners)), column) for column in corners.T], 1)
         estimate = checker.collision_probability(path)
-        took = in_turns({"path": lambda path=path: checker.collision_probability(path)})["path"]
-        causes = seconds(lambda estimate=estimate: estimate.first_contact)
+        took = medians({"path": lambda path=path: checker.collision_probability(path)})["path"]
+        began = time.perf_counter()
+        _ = estimate.first_contact
+        causes = time.perf_counter() - began
         print(
             f"{name}, 100 waypoints: {1e3 * took:.2f} ms for {estimate.configurations} samples "
             f"(P {estimate.probability:.3f}); causes, if asked, {1e3 * causes:.2f} ms more"
@@ -96,18 +77,16 @@ def per_path(checker: vp.CollisionChecker, bounded: vp.CollisionChecker) -> None
 
 def building(checker: vp.CollisionChecker) -> None:
     """256 worlds from nothing, everything baked, beside the fit of the map."""
-    observation = vp.load_observation(Path(vp.__file__).parent / "data" / "demo_scene")
-    fits, builds, size = [], [], 0
-    for _ in range(3):
-        fits.append(seconds(lambda: vp.fit_map(observation)))
-        began = time.perf_counter()
-        worlds = vp.PosteriorWorlds(checker.world.map, n_worlds=256, reach=0.13)
-        worlds.bake()
-        builds.append(time.perf_counter() - began)
-        size = worlds.nbytes
-    fit, build = float(np.median(fits)), float(np.median(builds))
+    observation = vp.load_observation(DEMO)
+
+    def worlds() -> vp.PosteriorWorlds:
+        made = vp.PosteriorWorlds(checker.world.map, n_worlds=256, reach=0.13)
+        made.bake()
+        return made
+
+    fit, build = medians({"fit": lambda: vp.fit_map(observation), "bake": worlds}, 3).values()
     print(
-        f"256 worlds of the demo scene, all blocks: {build:.2f} s, {size / 1e6:.0f} MB; "
+        f"256 worlds of the demo scene, all blocks: {build:.2f} s, {worlds().nbytes / 1e6:.0f} MB; "
         f"fit {fit:.2f} s; ratio {build / fit:.2f}"
     )
 

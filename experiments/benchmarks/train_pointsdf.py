@@ -14,10 +14,9 @@ on the same machine give the same weights.
 import argparse
 import json
 import os
-import subprocess
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +24,12 @@ import numpy as np
 
 from experiments.baselines.pointsdf.data import Examples, examples_of
 from experiments.baselines.pointsdf.shapes import training_scene
-from experiments.baselines.pointsdf.training import (
-    LEVELS,
-    Look,
-    Schedule,
-    mean_iou,
-    train,
-)
+from experiments.baselines.pointsdf.training import LEVELS, Look, Schedule, mean_iou, train
 from experiments.baselines.pointsdf.weights import SHIPPED, save_network
 from experiments.protocols import TrueScene
+from experiments.tables.scoring import commit
 from vprism_plan._files import write_text
-from vprism_plan.simulation.placement import random_camera
+from vprism_plan.simulation.scenes import random_camera
 
 ROOT = Path(__file__).resolve().parents[2]
 VERSION = 1  # of the examples; raised by hand when generator or sampling change their meaning
@@ -146,15 +140,6 @@ def picture(looks: Sequence[Look], file: Path) -> None:
     save_figure(figure, file)
 
 
-def commit() -> str:
-    """Return the commit of the checkout, or "unknown" outside of one."""
-    try:
-        call = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-        return subprocess.run(call, check=True, capture_output=True, text=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-
-
 def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     parser = argparse.ArgumentParser(
@@ -200,13 +185,13 @@ def main() -> None:
             "objects": f"random-train 000 to {HELD_OUT_OBJECT - 1}", "examples": len(examples),
             "validation": sizes,
         },
-        "schedule": schedule.to_dict(),
-        "kept": replace(best, iou=final).to_dict(),
+        "schedule": asdict(schedule),
+        "kept": asdict(replace(best, iou=final)),
         "levels": list(LEVELS),
         "commit": commit(),
     }  # fmt: skip
     save_network(model, args.output, history)
-    full = {**history, "looks": [look.to_dict() for look in looks]}
+    full = {**history, "looks": [asdict(look) for look in looks]}
     write_text(args.data / "training.json", json.dumps(full, indent=1) + "\n")
     picture(looks, args.data / "training.png")
     size = args.output.stat().st_size / 1e6

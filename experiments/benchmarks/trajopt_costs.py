@@ -13,18 +13,17 @@ medians' ratios are printed. One thread each.
 
 import argparse
 import os
-import time
 
 os.environ.setdefault("VPRISM_PLAN_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 
 import vprism_plan as vp
+from experiments.benchmarks._common import DEMO, ROOT, in_turns
 from vprism_plan.trajopt import (
     ClearanceCost,
     EntropyCost,
@@ -37,7 +36,6 @@ from vprism_plan.trajopt import (
 )
 from vprism_plan.trajopt.cost import Subdivision, sample_paths
 
-ROOT = Path(__file__).resolve().parents[2]
 SPACING = 0.05  # metres between samples: the costs' default
 
 
@@ -76,19 +74,6 @@ def both_ways(cost: TrajectoryCost, q: torch.Tensor) -> Callable[[], None]:
     return run
 
 
-def in_turns(tasks: dict[str, Callable[[], None]], repeats: int) -> dict[str, np.ndarray]:
-    """Seconds of every task, measured one after the other, round by round."""
-    times: dict[str, list[float]] = {name: [] for name in tasks}
-    for task in tasks.values():
-        task()
-    for _ in range(repeats):
-        for name, task in tasks.items():
-            start = time.perf_counter()
-            task()
-            times[name].append(time.perf_counter() - start)
-    return {name: np.array(own) for name, own in times.items()}
-
-
 def costs_of(world: vp.World, robot: vp.Robot, subsamples: int | None) -> dict[str, TrajectoryCost]:
     """Costs on baked fields."""
     options = {"spacing": SPACING, "subsamples": subsamples}
@@ -119,8 +104,7 @@ def main() -> None:
     parser.add_argument("--exact-repeats", type=int, default=2)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    scene = Path(vp.__file__).parent / "data" / "demo_scene"
-    world = vp.World(vp.fit_map(vp.load_observation(scene), vp.MapConfig(), seed=0))
+    world = vp.World(vp.fit_map(vp.load_observation(DEMO), vp.MapConfig(), seed=0))
     base = np.eye(4)
     base[0, 3] = -0.5
     robot = vp.Robot.from_urdf(ROOT / "urdf" / "panda.urdf", base_pose=base)

@@ -111,10 +111,7 @@ def _compile(mujoco: Any, shapes: list[Shape]) -> Any:
         body = spec.worldbody.add_body(name=f"object{index}")
         body.add_freejoint()
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"shape{index}",
-            density=_DENSITY,
-            **contact,
+            type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"shape{index}", density=_DENSITY, **contact
         )
     model = spec.compile()
     model.dof_damping[:] = np.tile(_DAMPING, len(shapes))

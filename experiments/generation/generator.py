@@ -13,7 +13,7 @@ from experiments.generation.scene import MeshObject, MeshScene
 from experiments.generation.sources import KINDS, Source, source
 from vprism_plan.errors import ConfigError
 from vprism_plan.simulation.camera import DepthNoise
-from vprism_plan.simulation.placement import random_camera
+from vprism_plan.simulation.scenes import random_camera
 
 FEWEST, MOST = 3, 10  # objects, where the seed draws the number
 _ATTEMPTS = 50

@@ -7,8 +7,7 @@ import numpy as np
 
 from vprism_plan.errors import MissingDependencyError
 from vprism_plan.perception.observation import Observation
-from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.imaging import sense, table_depth
+from vprism_plan.simulation.camera import Camera, DepthNoise, sense, table_depth
 
 if TYPE_CHECKING:
     import trimesh
@@ -29,16 +28,9 @@ def observe(
     noise: DepthNoise | None,
     seed: int,
 ) -> Observation:
-    """Return what a camera sees of meshes in the world frame: depth, labels, a picture.
+    """Return what a camera sees of meshes (world, m) with these labels: depth, labels, a picture.
 
-    Depth is rounded to 0.1 mm, which is what the saved image holds.
-
-    Args:
-        meshes: one per object, metres.
-        labels: object id of each.
-        camera: the view, outside of every object.
-        noise: sensor model, or None for depth that is exact but for the rounding.
-        seed: of the noise; the same seed gives the same bits.
+    Depth is rounded to 0.1 mm, which is what the saved image holds; the noise follows `seed`.
     """
     directions = camera.ray_directions()
     depth = table_depth(camera, directions)

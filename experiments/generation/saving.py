@@ -14,7 +14,7 @@ split. Nothing that plans reads the ground truth.
 
 import json
 import tempfile
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,8 @@ from vprism_plan.perception import load_observation
 from vprism_plan.perception.camera import invert_transform
 from vprism_plan.perception.observation import check_pose
 from vprism_plan.perception.readers import write_atomically
-from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.scene_io import GROUND_TRUTH
+from vprism_plan.simulation.camera import Camera
+from vprism_plan.simulation.scene_io import GROUND_TRUTH, view_from_dict, view_to_dict
 
 _FORMAT = "vprism_plan mesh scene, version 1"
 _MILLIMETRE = 0.001
@@ -86,15 +86,9 @@ def _assembled(folder: Path, data: dict[str, Any]) -> MeshScene:
         pose = np.array(entry["pose"], dtype=np.float64)
         objects.append(MeshObject(entry["name"], vertices, faces, pose))
     seen = load_observation(folder)
-    camera = Camera(
-        np.array(data["camera"]["T_world_camera"], dtype=np.float64),
-        np.array(data["camera"]["intrinsics"], dtype=np.float64),
-        data["camera"]["width"],
-        data["camera"]["height"],
-    )
+    camera, noise = view_from_dict(data)
     # A camera that the generator did not round differs from its file in the last bits.
     observation = replace(seen, T_world_camera=camera.T_world_camera, intrinsics=camera.intrinsics)
-    noise = None if data["noise"] is None else DepthNoise(**data["noise"])
     return MeshScene(
         tuple(objects), camera, observation, noise, data["seed"], data["name"], data["kind"]
     )
@@ -177,13 +171,7 @@ def _description(scene: MeshScene) -> dict[str, Any]:
         "name": scene.name,
         "kind": scene.kind,
         "seed": scene.seed,
-        "noise": None if scene.noise is None else asdict(scene.noise),
-        "camera": {
-            "T_world_camera": scene.camera.T_world_camera.tolist(),
-            "intrinsics": scene.camera.intrinsics.tolist(),
-            "width": scene.camera.width,
-            "height": scene.camera.height,
-        },
+        **view_to_dict(scene.camera, scene.noise),
         "objects": [{"name": body.name, "pose": body.pose.tolist()} for body in scene.objects],
     }
 

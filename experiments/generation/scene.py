@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from experiments.generation.raycasting import observe
-from experiments.generation.truth import MeshTruth, checked_points
+from experiments.generation.truth import MeshTruth
+from experiments.protocols import checked_points
+from vprism_plan.errors import ConfigError
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.simulation.camera import Camera, DepthNoise
@@ -98,7 +100,7 @@ class MeshScene:
         Raises:
             ConfigError: points that are not (n, 3) or not finite.
         """
-        points = checked_points(points)
+        points = checked_points(points, ConfigError)
         best = points[:, 2].copy() if table else np.full(len(points), np.inf)
         local = [body.to_local(points) for body in self.objects]
         away = np.stack(
@@ -121,7 +123,7 @@ class MeshScene:
         Raises:
             ConfigError: points that are not (n, 3) or not finite.
         """
-        points = checked_points(points)
+        points = checked_points(points, ConfigError)
         ids = np.zeros(len(points), dtype=np.int64)
         for label, body, truth in zip(self.object_ids, self.objects, self._truths, strict=True):
             ids[truth.contains(body.to_local(points))] = label

@@ -20,14 +20,9 @@ from typing import Protocol
 
 import numpy as np
 
-from experiments.generation.shapes import (
-    MESH_SUFFIXES,
-    Shape,
-    read_shape,
-    shape_of,
-)
+from experiments.generation.shapes import MESH_SUFFIXES, Shape, read_shape, shape_of
 from vprism_plan.errors import ConfigError, MissingDependencyError
-from vprism_plan.simulation.placement import random_solid
+from vprism_plan.simulation.scenes import random_solid
 
 SETS = ("analytic", "ycb", "random")  # the sets of the tables
 KINDS = (*SETS, "random-train", "folder")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.errors import ConfigError, MissingDependencyError
+from vprism_plan.errors import MissingDependencyError
 
 _INSIDE = 0.5  # winding number from which a point is inside
 _CHUNK = 1 << 18  # points per call, which bounds the memory
@@ -61,14 +61,3 @@ class MeshTruth:
         """Return the distance to the box around it, 0 inside: no surface is nearer."""
         outside = np.maximum(np.maximum(self.low - points, points - self.high), 0.0)
         return np.asarray(np.linalg.norm(outside, axis=1))
-
-
-def checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
-    """Return finite points as float64 (libigl crashes on others); raises ConfigError."""
-    array = np.ascontiguousarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ConfigError(f"points have shape {array.shape}; give (n, 3) metres")
-    if not np.isfinite(array).all():
-        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-        raise ConfigError(f"point {row} is {array[row].tolist()}; coordinates must be finite")
-    return array

@@ -14,27 +14,21 @@ from jaxtyping import Float
 from experiments.planning_benchmark.checkers import Bench
 from experiments.planning_benchmark.contenders import Contender
 from experiments.planning_benchmark.grid_world import benchmark_robot, views_of
-from experiments.planning_benchmark.problems import (
-    Criteria,
-    Problem,
-    find_problems,
-    tip_sphere,
-)
+from experiments.planning_benchmark.problems import Criteria, Problem, find_problems, tip_sphere
 from experiments.planning_benchmark.truth import PathTruth, Truth
 from experiments.protocols import TrueScene
+from experiments.stored import Stored
 from experiments.tables.scoring import commit
 from experiments.tables.store import Case
 from vprism_plan.planning import PlanResult, plan
 from vprism_plan.world import WorldConfig
 from vprism_plan.world.visibility import OCCLUDED, SEEN, classify_points
 
-__all__ = ["Answer", "Limits", "answer_case", "problem_case", "scene_of"]
-
 SOLIDS = "solids"  # analytic solids without physics: needs no optional package
 
 
 @dataclass(frozen=True)
-class Limits:
+class Limits(Stored):
     """What every contender is given. Seconds of processor time, so that a busy machine gives
     as much as an idle one.
 
@@ -50,7 +44,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(Stored):
     """What became of one problem with one checker.
 
     Attributes:
@@ -84,17 +78,6 @@ class Answer:
         """Whether the checker's planner returned a path."""
         return self.status == "exact"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        truth = None if self.truth is None else self.truth.to_dict()
-        return {**vars(self), "truth": truth}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Answer":
-        """Rebuild from `to_dict`."""
-        truth = None if data["truth"] is None else PathTruth.from_dict(data["truth"])
-        return cls(**{**data, "truth": truth})
-
 
 def scene_of(kind: str, seed: int, data: str | None = None) -> TrueScene:
     """Return a scene of the generator, or of the analytic solids ("solids")."""
@@ -123,8 +106,7 @@ def problem_case(case: Case) -> dict[str, Any]:
     """Find the problems of one scene: a task for `sweep`."""
     asked = case.asked
     truth = _truth(asked["kind"], asked["seed"], case.given.get("data"))
-    given = asked["criteria"]
-    criteria = Criteria(**{**given, "ends": tuple(given["ends"])})
+    criteria = Criteria.from_dict(asked["criteria"])
     problems = find_problems(truth, asked["count"], asked["seed"], criteria)
     return {
         "scene": truth.scene.name,

@@ -35,8 +35,6 @@ from vprism_plan.world.config import OccludedPolicy
 from vprism_plan.world.distance import Lattice
 from vprism_plan.world.visibility import background_points
 
-__all__ = ["Bench", "known_nodes"]
-
 _OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things
 _CELLS = 2  # cells per grid step that observed points mark
 OCTOMAP_OCCUPIED = 1
@@ -155,9 +153,7 @@ class Bench:
             )  # fmt: skip
         return world_of_lattice(lattice, grid, names, self.observation)
 
-    def _things(
-        self,
-    ) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, Float[np.ndarray, " n"]]:
+    def _things(self) -> tuple[Float[np.ndarray, "n 3"], np.ndarray, Float[np.ndarray, " n"]]:
         """Points (m) off the table, their labels and depths (m); flying pixels left out."""
         view = self.observation
         points, labels = view.points()

@@ -5,20 +5,19 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from experiments.stored import Stored
 from vprism_plan.collision import CheckerConfig
 from vprism_plan.errors import ConfigError
 from vprism_plan.mapping import MapConfig
 from vprism_plan.world import WorldConfig
 from vprism_plan.world.config import OccludedPolicy
 
-__all__ = ["CONTENDERS", "LONE", "STRAYS", "Contender", "contenders", "full_label", "settings"]
-
 STRAYS = 0.03  # share of neighbours below which a point is a flying pixel, as in the map
 LONE = 0.03  # the same of points without a label: `WorldConfig.lone_share` for every contender
 
 
 @dataclass(frozen=True)
-class Contender:
+class Contender(Stored):
     """One row of the benchmark.
 
     Attributes:
@@ -46,15 +45,10 @@ class Contender:
     resolution: float = 0.01
     step: float = 0.005
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Contender":
         """Rebuild from `to_dict`, or from `question`."""
-        words = {"label": data["key"], "line": data["key"]}
-        return cls(**{**words, **data, "bounds": tuple((m, r) for m, r in data["bounds"])})
+        return super().from_dict({"label": data["key"], "line": data["key"], **data})
 
     def question(self) -> dict[str, Any]:
         """Return what its answers depend on: all but how it is called in tables."""

@@ -18,8 +18,6 @@ from vprism_plan.collision.inputs import Numbers
 from vprism_plan.robots import Robot
 from vprism_plan.world import World
 
-__all__ = ["FclChecker"]
-
 
 class FclChecker(MeshChecker):
     """FCL's verdicts on the mean map's meshes and the support surface, no more.

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from experiments.protocols import TrueScene
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.robots import Robot
@@ -21,8 +20,6 @@ from vprism_plan.world import DistanceField, Grid, WorldConfig
 from vprism_plan.world.distance import Lattice, NodeDistances, distance_to_lattice, finish
 from vprism_plan.world.grid import choose_grid
 from vprism_plan.world.visibility import OUTSIDE, View, classify_points, make_view
-
-__all__ = ["GridWorld", "benchmark_grid", "checker_of", "views_of", "world_of_lattice"]
 
 _AROUND = 0.6  # metres around the seen objects, as a `World` chooses
 _UNDER, _ABOVE = 0.02, 1.0  # metres below and above the support
@@ -149,8 +146,3 @@ def benchmark_robot() -> Robot:
     base[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     base[:3, 3] = (0.05, -0.6, 0.0)
     return Robot.from_urdf(urdf_path("panda"), base_pose=base)
-
-
-def scene_views(scene: TrueScene) -> tuple[View, ...]:
-    """Return what a scene's camera saw."""
-    return views_of(scene.observation)

@@ -17,8 +17,6 @@ from experiments.planning_benchmark.contenders import full_label
 from experiments.planning_benchmark.summary import Outcome
 from vprism_plan._files import write_text
 
-__all__ = ["log_text", "write_log"]
-
 _STATUS = (
     "exact", "approximate", "timeout", "invalid_start", "invalid_goal", "verification_failed",
     "too_risky",
@@ -39,15 +37,7 @@ _PROPERTIES = (
 
 
 def log_text(found: Sequence[Outcome], name: str, limits: Limits, setup: str, date: str) -> str:
-    """Return the log.
-
-    Args:
-        found: every contender's outcome.
-        name: of the experiment; no spaces count, so they become underscores.
-        limits: what every contender was given.
-        setup: lines on what was asked.
-        date: when it was computed, ISO 8601.
-    """
+    """Return the log; `setup` are lines on what was asked, `date` is in ISO 8601."""
     runs = sum(len(scene) for scene in found[0].answers) if found else 0
     total = sum(answer.processor for outcome in found for answer in outcome.all)
     lines = [

@@ -8,22 +8,20 @@ solved on the true geometry with room to spare, so a checker that knew the truth
 
 import logging
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from experiments.planning_benchmark.grid_world import views_of
 from experiments.planning_benchmark.truth import Truth
+from experiments.stored import Stored
 from vprism_plan.collision import CollisionChecker
 from vprism_plan.collision.motion import place_points, sphere_jacobians
 from vprism_plan.planning import plan
 from vprism_plan.robots import Robot
 from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.world.visibility import OCCLUDED, classify_points
-
-__all__ = ["Criteria", "Problem", "find_problems"]
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +35,7 @@ _REACHED = 0.003  # metres
 
 
 @dataclass(frozen=True)
-class Criteria:
+class Criteria(Stored):
     """What a problem must be. Lengths in metres.
 
     Attributes:
@@ -60,13 +58,9 @@ class Criteria:
     tilt: float = 1.3
     time_limit: float = 3.0
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
-class Problem:
+class Problem(Stored):
     """A query whose answer exists.
 
     Attributes:
@@ -83,16 +77,6 @@ class Problem:
     hidden: tuple[bool, bool]
     hand: tuple[float, float]
     seed: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Problem":
-        """Rebuild from `to_dict`."""
-        lists = ("start", "goal", "hidden", "hand")
-        return cls(**{**data, **{name: tuple(data[name]) for name in lists}})
 
 
 @dataclass(frozen=True)

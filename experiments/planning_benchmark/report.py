@@ -25,8 +25,6 @@ from experiments.planning_benchmark.summary import (
 from vprism_plan._files import write_text
 from vprism_plan.errors import ConfigError
 
-__all__ = ["benchmark", "markdown", "write_report"]
-
 KEY = "planning"
 _KNOWN = {
     "seen": "what the camera saw",
@@ -49,24 +47,12 @@ def benchmark(
     criteria: Criteria | None = None,
     limits: Limits | None = None,
     data: Path | None = None,
-    jobs: int = 2,
-    backend: str = "loky",
-    progress: bool = True,
-    cluster: Any = None,
     command: str = "",
+    **how: Any,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run the benchmark on `scenes` scenes in all, shared out among the kinds, and write it.
 
-    Args:
-        kinds: sets of scenes; each gets an equal share of `scenes`, at least one.
-        scenes: in all.
-        output: folder of the reports.
-        command: that reprints them.
-        first_seed, store, checkers, count, criteria, limits, data, jobs, backend, progress,
-            cluster: see `run`.
-
-    Returns:
-        The figures, ready for JSON, and the files written.
+    Returns the figures, ready for JSON, and the files. Other arguments are those of `run`.
 
     Raises:
         ConfigError: fewer scenes than kinds; or as `run`.
@@ -85,8 +71,7 @@ def benchmark(
         own = scenes // len(kinds) + (number < scenes % len(kinds))
         found[kind] = run(
             kind, own, first_seed, checkers=chosen, count=count, criteria=criteria,
-            limits=limits, store=store, data=data if kind in ("ycb", "folder") else None,
-            jobs=jobs, backend=backend, progress=progress, cluster=cluster,
+            limits=limits, store=store, data=data if kind in ("ycb", "folder") else None, **how,
         )  # fmt: skip
     answers = [entry for own in found.values() for entry in own.answers]
     failures = [own.failed for own in found.values() if own.failed is not None]
@@ -112,14 +97,7 @@ def benchmark(
 def write_report(
     found: Sequence[dict[str, Any]], about: dict[str, Any], output: Path
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Write planning.md, .json, .png, -fates.png and .log into a folder.
-
-    Args:
-        found: answers of `run`.
-        about: what was asked: kinds, (scenes of each), replaced, left_out, first_seed,
-            count, criteria, limits, command, commits.
-        output: the folder.
-    """
+    """Write planning.md, .json, .png, -fates.png and .log of answers and what was asked."""
     from experiments.planning_benchmark.pictures import curve_figure, fates_figure
     from vprism_plan.viz._figures import save_figure
 

@@ -12,19 +12,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.planning_benchmark.asking import (
-    Answer,
-    Limits,
-    answer_case,
-    problem_case,
-)
+from experiments.planning_benchmark.asking import Answer, Limits, answer_case, problem_case
 from experiments.planning_benchmark.contenders import contenders, settings
 from experiments.planning_benchmark.problems import Criteria
 from experiments.tables import scoring
-from experiments.tables.sweep import Case, SweepError, sweep
+from experiments.tables.sweep import Case, SweepError, sweep, sweep_complete
 from vprism_plan.errors import ConfigError
-
-__all__ = ["Found", "answers_of", "run"]
 
 # Of what an answer means, part of every question: raised by hand whenever the robot, the
 # planner, a world, a checker or the scenes change what they answer to the same settings.
@@ -59,29 +52,18 @@ def run(
     limits: Limits | None = None,
     store: Path = Path("build/evaluation/planning"),
     data: Path | None = None,
-    jobs: int = 2,
-    backend: str = "loky",
-    progress: bool = True,
-    cluster: Any = None,
+    **how: Any,
 ) -> Found:
     """Return the answers of every contender on every scene.
 
-    A scene on which a contender raises is left out for all of them.
+    A scene on which a contender raises is left out for all of them. Arguments as those of
+    `tables.reconstruction.run`, and:
 
     Args:
-        kind: "analytic", "ycb", "random", "folder" or "solids".
+        kind: a set of scenes, also "solids" (analytic, without physics).
         scenes: how many; seeds from first_seed on, but those that offer too few problems.
-        first_seed: of the scenes, their problems and the maps.
         checkers: keys of `CONTENDERS`; all if None.
         count: problems per scene.
-        criteria: what the problems must be.
-        limits: planner and time limits.
-        store: folder that keeps every answer.
-        data: folder of meshes, where the kind needs one.
-        jobs: processes.
-        backend: "loky", "dask" or "ray".
-        progress: whether to show it.
-        cluster: see `experiments.sweep`.
 
     Raises:
         ConfigError: an unknown contender, no scene or problem asked for, or too few scenes
@@ -91,16 +73,11 @@ def run(
     if scenes < 1 or count < 1:
         raise ConfigError(f"scenes is {scenes}, count {count}; both must be at least 1")
     chosen = contenders(checkers)
-    about = {
-        "version": VERSION, "kind": kind, "data": scoring.data_digest(kind, data),
-    }  # fmt: skip
+    about = {"version": VERSION, "kind": kind, "data": scoring.data_digest(kind, data)}
     given = scoring.whereabouts(kind, data)
-    options: dict[str, Any] = {
-        "jobs": jobs, "backend": backend, "progress": progress, "cluster": cluster
-    }  # fmt: skip
     asked = {"count": count, "criteria": (Criteria() if criteria is None else criteria).to_dict()}
     problems, replaced = _problems(
-        {**about, **asked}, given, scenes, first_seed, Path(store) / "problems", options
+        {**about, **asked}, given, scenes, first_seed, Path(store) / "problems", how
     )
     limits = Limits() if limits is None else limits
     cases = [
@@ -114,18 +91,11 @@ def run(
         for contender in chosen
     ]  # fmt: skip
     # All contenders of a scene in one process: they share the scene, the map and its worlds.
-    options["group"] = _scene_of_case
-    failed: SweepError | None = None
-    try:
-        answers = sweep(answer_case, cases, Path(store) / "answers", **options)
-    except SweepError as error:
-        failed = error
-        names = {failure.name for failure in error.failures}
-        lost = {_scene_of_case(case) for case in cases if case.name in names}
-        cases = [case for case in cases if _scene_of_case(case) not in lost]
-        if not cases:
-            raise
-        answers = sweep(answer_case, cases, Path(store) / "answers", **options)
+    _, answers, failed = sweep_complete(
+        answer_case, cases, Path(store) / "answers", group=lambda case: case.asked["seed"], **how
+    )
+    if failed is not None and not answers:
+        raise failed
     return Found(answers, replaced, failed)
 
 
@@ -157,10 +127,6 @@ def _problems(
             f"problems, {scenes} are wanted; ask for fewer problems, or loosen the criteria"
         )
     return full, short
-
-
-def _scene_of_case(case: Case) -> tuple[str, int]:
-    return str(case.asked["kind"]), int(case.asked["seed"])
 
 
 def answers_of(found: Sequence[dict[str, Any]], key: str) -> list[tuple[str, Answer]]:

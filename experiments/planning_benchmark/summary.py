@@ -11,10 +11,9 @@ from jaxtyping import Float
 
 from experiments.planning_benchmark.asking import Answer
 from experiments.planning_benchmark.contenders import CONTENDERS, Contender, full_label
+from experiments.stored import Stored
 from experiments.tables.intervals import Estimate, Statistic, ratio
 from vprism_plan.errors import ConfigError
-
-__all__ = ["OURS", "Outcome", "Statement", "outcomes", "statements"]
 
 DEEP = 0.005  # metres of penetration that are more than a graze
 OURS = "ours"  # what our contenders' keys begin with
@@ -170,7 +169,7 @@ def outcomes(found: Sequence[dict[str, Any]]) -> list[Outcome]:
 
 
 @dataclass(frozen=True)
-class Statement:
+class Statement(Stored):
     """A comparison of our curve with one contender.
 
     Attributes:
@@ -191,22 +190,14 @@ class Statement:
     quotient: Estimate
     reached: bool
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return {**vars(self), "quotient": self.quotient.to_dict()}
-
 
 def front(
     success: Float[np.ndarray, " n"], collided: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Return what can be reached by tossing a coin between contenders: the lower hull.
 
-    Args:
-        success: share of the problems with a path.
-        collided: share of the problems whose path collides.
-
-    Returns:
-        Success in rising order from 0, and the least share of collisions there.
+    Of shares of the problems with a path, and whose path collides: success in rising order
+    from 0, and the least share of collisions there.
     """
     points = sorted({(0.0, 0.0), *zip(success.tolist(), collided.tolist(), strict=True)})
     hull: list[tuple[float, float]] = []
@@ -256,10 +247,7 @@ def statements(found: Sequence[Outcome]) -> list[Statement]:
     """Compare our curve with meshes at their success (with wide steps and with fine ones), and
     with unknown occupied at its collisions."""
     ours = [outcome for outcome in found if outcome.contender.key.startswith(OURS)]
-    groups = {
-        "ours": ours,
-        "ours with one rule": [o for o in ours if len(o.contender.bounds) == 1],
-    }
+    groups = {"ours": ours, "ours with one rule": [o for o in ours if len(o.contender.bounds) == 1]}
     by_key = {outcome.contender.key: outcome for outcome in found}
     made = []
     for key, asked in (

@@ -7,19 +7,15 @@ nearest. Between two samples no point of the robot moves more than 2 mm, so what
 says of the depth is at most 1 mm short.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.planning_benchmark.grid_world import (
-    benchmark_grid,
-    checker_of,
-    world_of_distances,
-)
+from experiments.planning_benchmark.grid_world import benchmark_grid, checker_of, world_of_distances
 from experiments.protocols import TrueScene
+from experiments.stored import Stored
 from vprism_plan.collision import CollisionChecker
 from vprism_plan.collision.motion import Edges, edges_of, place_points
 from vprism_plan.perception import Plane
@@ -27,8 +23,6 @@ from vprism_plan.robots import Robot
 from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.world import DistanceField, Grid
 from vprism_plan.world.distance import round_down
-
-__all__ = ["PathTruth", "Truth", "true_field"]
 
 TOLERANCE = 0.001  # metres of motion between a point of a path and the nearest sample
 _COARSE = 4  # nodes of the fine grid per node of the coarse one
@@ -39,7 +33,7 @@ _DEPTHS = (0.0005, 0.001, 0.002, 0.004, 0.008)  # metres under a surface, to nam
 
 
 @dataclass(frozen=True)
-class PathTruth:
+class PathTruth(Stored):
     """What the true scene says of a path.
 
     Attributes:
@@ -70,15 +64,6 @@ class PathTruth:
     def depth(self) -> float:
         """Depth of the worst penetration, metres; 0 without."""
         return max(0.0, -self.clearance)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "PathTruth":
-        """Rebuild from `to_dict`."""
-        return cls(**{**data, "point": tuple(data["point"])})
 
 
 def true_field(scene: TrueScene, grid: Grid) -> DistanceField:

@@ -5,9 +5,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 from experiments.baselines import METHODS, method
+from experiments.stored import Stored
 from experiments.tables.intervals import (
     Estimate,
     SceneScores,
@@ -43,7 +44,7 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Stored):
     """What the numbers say of a claim.
 
     Attributes:
@@ -57,10 +58,6 @@ class Verdict:
     answer: str
     gain: Estimate
     pair: tuple[str, str]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return {"answer": self.answer, "gain": self.gain.to_dict(), "pair": list(self.pair)}
 
 
 def gain(

@@ -8,7 +8,6 @@ hide one another and are not independent.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,6 +15,7 @@ from jaxtyping import Float, Int
 from experiments.metrics import Reliability, ReliabilityBin
 from experiments.reconstruction import ReconstructionScores
 from experiments.scene_truth import PARTS
+from experiments.stored import Stored
 from vprism_plan.errors import ConfigError
 
 RESAMPLES = 4999
@@ -24,7 +24,7 @@ Statistic = Callable[[Int[np.ndarray, "*batch n"]], Float[np.ndarray, "*batch"]]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class Estimate(Stored):
     """A figure over scenes and its 95 percent bootstrap interval.
 
     `low` and `high` are NaN with fewer than two scenes, or where a draw leaves the figure
@@ -34,15 +34,6 @@ class Estimate:
     value: float
     low: float
     high: float
-
-    def to_dict(self) -> dict[str, float | None]:
-        """Return the three numbers, null for NaN."""
-        return {k: None if math.isnan(v) else v for k, v in vars(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "Estimate":
-        """Rebuild from `to_dict`."""
-        return cls(**{k: math.nan if v is None else v for k, v in data.items()})
 
 
 def estimate(statistic: Statistic, scenes: int, seed: int = 0) -> Estimate:

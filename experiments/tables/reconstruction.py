@@ -15,15 +15,13 @@ import numpy as np
 
 from experiments.reconstruction import ReconstructionScores
 from experiments.tables import scoring
-from experiments.tables.claims import Verdict, claims_of, decide
+from experiments.tables.claims import claims_of, decide
 from experiments.tables.intervals import SceneScores
 from experiments.tables.report import write_report
-from experiments.tables.results import SetResults, Table, TableResults, summary
+from experiments.tables.results import SetResults, Table, TableResults
 from experiments.tables.store import Case, require_writable
-from experiments.tables.sweep import SweepError, sweep
+from experiments.tables.sweep import sweep_complete
 from vprism_plan.errors import ConfigError
-
-__all__ = ["TABLES", "SetResults", "Table", "TableResults", "chosen_table", "run", "summary"]
 
 TABLES = {
     table.key: table
@@ -67,11 +65,8 @@ def run(
     data: Path | None = None,
     store: Path,
     output: Path,
-    jobs: int = 2,
-    backend: str = "loky",
-    cluster: Any = None,
     command: str = "",
-    progress: bool = True,
+    **how: Any,
 ) -> tuple[TableResults, list[Path]]:
     """Compute what is missing of a table, write its report; return results and files.
 
@@ -83,8 +78,8 @@ def run(
         data: folder of meshes, for the sets that need one.
         store: folder of answers, shared by all tables.
         output: folder of KEY.md, KEY.json and pictures.
-        jobs, backend, cluster, progress: see `sweep`.
         command: that reprints this, for the report.
+        how: jobs, backend, cluster, progress: see `sweep`.
 
     Raises:
         ConfigError: unknown table, set or method, no scene, missing data, or a folder that
@@ -98,36 +93,24 @@ def run(
     require_writable(output)
     seeds = range(first_seed, first_seed + scenes)
     cases = scoring.cases_of_sets(kinds, seeds, chosen, data)
-    failed: SweepError | None = None
-    options: dict[str, Any] = {
-        "jobs": jobs, "backend": backend, "progress": progress, "group": scoring.scene_of,
-        "cluster": cluster,
-    }  # fmt: skip
-    try:
-        answers = sweep(scoring.score, cases, store, **options)
-    except SweepError as error:
-        failed = error
-        cases = _without(cases, failed, kinds)
-        answers = sweep(scoring.score, cases, store, **options)
+    cases, answers, failed = sweep_complete(
+        scoring.score, cases, store, group=scoring.scene_of, **how
+    )
+    if failed is not None and {scoring.scene_of(case)[0] for case in cases} != set(kinds):
+        raise failed
     sets = tuple(_collected(kind, cases, answers) for kind in kinds)
     results = TableResults(
-        table, chosen, seeds, sets, command, _verdicts(key, chosen, sets),
+        table, chosen, seeds, sets, command,
+        {
+            claim.text: {found.kind: decide(claim, found.scores) for found in sets}
+            for claim in claims_of(key, chosen)
+        },
         () if failed is None else tuple(f"{f.name}: {f.error}" for f in failed.failures),
     )  # fmt: skip
     files = write_report(results, output)
     if failed is not None:
         raise failed
     return results, files
-
-
-def _without(cases: Sequence[Case], failed: SweepError, kinds: Sequence[str]) -> list[Case]:
-    """Return the cases of scenes on which every method has an answer; raise if a set has none."""
-    names = {failure.name for failure in failed.failures}
-    scenes = {scoring.scene_of(case) for case in cases if case.name in names}
-    kept = [case for case in cases if scoring.scene_of(case) not in scenes]
-    if {scoring.scene_of(case)[0] for case in kept} != set(kinds):
-        raise failed
-    return kept
 
 
 def chosen_table(key: str) -> Table:
@@ -177,12 +160,3 @@ def _cost(answers: Sequence[dict[str, Any]]) -> tuple[float, float]:
         float(np.median([a["seconds"]["fit"] for a in answers])),
         1e6 * sum(a["seconds"]["predict"] for a in answers) / points,
     )
-
-
-def _verdicts(
-    key: str, methods: Sequence[str], sets: Sequence[SetResults]
-) -> dict[str, dict[str, Verdict]]:
-    return {
-        claim.text: {found.kind: decide(claim, found.scores) for found in sets}
-        for claim in claims_of(key, methods)
-    }

@@ -13,15 +13,7 @@ from experiments.tables.intervals import SceneScores, estimate
 
 @dataclass(frozen=True)
 class Table:
-    """A comparison of methods.
-
-    Attributes:
-        key: on the command line and in file names.
-        title: of the report.
-        about: what is compared, in a sentence or two.
-        methods: rows, in order.
-        reference: what the others are held against, scene by scene.
-    """
+    """A comparison of methods, in the order of its rows, with one of them scene by scene."""
 
     key: str
     title: str

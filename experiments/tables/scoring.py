@@ -99,11 +99,7 @@ def cases(
     questions = [(key, method_question(key)) for key in methods]
     given = whereabouts(kind, data)
     return [
-        Case(
-            f"{kind}-{seed}-{key}",
-            {"scene": scene, "method": question, "scores": SCORES},
-            given,
-        )
+        Case(f"{kind}-{seed}-{key}", {"scene": scene, "method": question, "scores": SCORES}, given)
         for seed in seeds
         for scene in [scene_question(kind, seed, data)]
         for key, question in questions

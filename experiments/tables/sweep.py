@@ -22,8 +22,6 @@ from experiments.tables.backends import one_thread, parallel, use_one_thread
 from experiments.tables.store import Case, Store, require_writable
 from vprism_plan.errors import ConfigError, VPrismError
 
-__all__ = ["Case", "Failure", "SweepError", "SweepInputError", "sweep"]
-
 _log = logging.getLogger(__name__)
 _LINE_EVERY = 30.0  # seconds between two lines of progress where no terminal shows a bar
 
@@ -136,6 +134,19 @@ def sweep(
         kind = SweepInputError if all(f.of_input for f in found) else SweepError
         raise kind(found, len(cases))
     return [answer for answer in answers if answer is not None]
+
+
+def sweep_complete(
+    task: Task, cases: Sequence[Case], store: Path, *, group: Callable[[Case], Hashable], **how: Any
+) -> tuple[list[Case], list[dict[str, Any]], SweepError | None]:
+    """Return the cases of all groups without a failure, their answers, and what failed."""
+    try:
+        return list(cases), sweep(task, cases, store, group=group, **how), None
+    except SweepError as failed:
+        names = {failure.name for failure in failed.failures}
+        lost = {group(case) for case in cases if case.name in names}
+        kept = [case for case in cases if group(case) not in lost]
+        return kept, sweep(task, kept, store, group=group, **how), failed
 
 
 def _refuse_duplicates(kept: Store, cases: Sequence[Case]) -> None:

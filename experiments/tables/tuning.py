@@ -9,11 +9,12 @@ confirmed there. Of the tables' objects only those of `random` were never tuned 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from experiments.baselines import Method
 from experiments.reconstruction import ReconstructionScores
 from experiments.tables import scoring
-from experiments.tables.claims import gain
+from experiments.tables.claims import Metric, gain
 from experiments.tables.intervals import Estimate, SceneScores, estimate
 from experiments.tables.sweep import Case, sweep
 from vprism_plan.errors import ConfigError
@@ -46,7 +47,7 @@ class Row:
     name: str
     iou: float
     chamfer: float
-    gains: tuple[Estimate, Estimate, Estimate, Estimate]
+    gains: tuple[Estimate, ...]
     seconds: float
 
 
@@ -55,11 +56,9 @@ def compare(
     kind: str,
     seeds: Sequence[int],
     store: Path,
-    *,
-    jobs: int = 2,
-    progress: bool = True,
+    **how: Any,
 ) -> list[Row]:
-    """Return what each setting gains over the first one, scene by scene.
+    """Return what each setting gains over the first one, scene by scene; `how` as in `sweep`.
 
     Raises:
         ConfigError: a seed is not one for tuning, the set is not one of `SETS`, or nothing
@@ -86,10 +85,8 @@ def compare(
         for seed in seeds
         for name, config in settings.items()
     ]
-    answers = sweep(
-        score_settings, cases, store, jobs=jobs, progress=progress, group=scoring.scene_of
-    )
-    count = len(settings)
+    answers = sweep(score_settings, cases, store, group=scoring.scene_of, **how)
+    count, n = len(settings), len(seeds)
     scores = [
         SceneScores([ReconstructionScores.from_dict(a["scores"]) for a in answers[i::count]])
         for i in range(count)
@@ -98,20 +95,9 @@ def compare(
     rows = []
     for i, name in enumerate(settings):
         own = scores[i]
-        gains = (
-            estimate(gain(own, reference, "iou"), len(seeds)),
-            estimate(gain(own, reference, "chamfer"), len(seeds)),
-            estimate(gain(own, reference, "brier"), len(seeds)),
-            estimate(gain(own, reference, "ece"), len(seeds)),
-        )
+        metrics: tuple[Metric, ...] = ("iou", "chamfer", "brier", "ece")
+        gains = tuple(estimate(gain(own, reference, metric), n) for metric in metrics)
         spent = [a["seconds"]["fit"] for a in answers[i::count]]
-        rows.append(
-            Row(
-                name,
-                estimate(own.iou(), len(seeds)).value,
-                estimate(own.chamfer(reference), len(seeds)).value,
-                gains,
-                sum(spent) / len(spent),
-            )
-        )
+        iou, chamfer = (estimate(s, n).value for s in (own.iou(), own.chamfer(reference)))
+        rows.append(Row(name, iou, chamfer, gains, sum(spent) / len(spent)))
     return rows

@@ -124,28 +124,15 @@ def run(
     data: Path | None = None,
     store: Path,
     output: Path,
-    jobs: int = 2,
-    backend: str = "loky",
-    cluster: Any = None,
     command: str = "",
     real: Path | None = None,
+    **how: Any,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Compare the entropy of V-PRISM with a point estimate's; return figures and files.
 
-    Args:
-        kinds: sets of scenes (see `generation.source`).
-        scenes, first_seed: seeds of each set.
-        data: folder of meshes, for the sets that need one.
-        store: folder of answers.
-        output: folder of uncertainty.md, .json and pictures.
-        jobs, backend, cluster: see `sweep`.
-        command: that reprints this, for the report.
-        real: folder of real depth images; None looks where $VPRISM_PLAN_REAL says, and in
-            ../shared/data/real beside the checkout. Without any they are left out.
-
-    Raises:
-        ConfigError: unknown set, no scene, missing data, or a folder that cannot be written.
-        SweepError: some scenes failed; all others are kept.
+    Arguments and errors as those of `tables.reconstruction.run`, but a failure ends it. `real`
+    is a folder of real depth images; None looks where $VPRISM_PLAN_REAL says, and in
+    ../shared/data/real beside the checkout. Without any they are left out.
     """
     from experiments.tables import uncertainty_report as report
 
@@ -156,9 +143,7 @@ def run(
         replace(one, asked={**one.asked, "scores": _VERSION})
         for one in scoring.cases_of_sets(kinds, seeds, METHODS, data)
     ]
-    answers = sweep(
-        compare, cases, store, jobs=jobs, backend=backend, group=scoring.scene_of, cluster=cluster
-    )
+    answers = sweep(compare, cases, store, group=scoring.scene_of, **how)
     with one_thread():  # as the workers that computed the answers
         frames = real_observations(real)
         fits = [{key: method(key).fit(seen, 0) for key in METHODS} for _, seen in frames]

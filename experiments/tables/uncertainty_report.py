@@ -58,10 +58,7 @@ class Heat:
 
 
 def heat_of(
-    name: str,
-    seen: Observation,
-    fits: dict[str, Reconstruction],
-    scene: TrueScene | None = None,
+    name: str, seen: Observation, fits: dict[str, Reconstruction], scene: TrueScene | None = None
 ) -> Heat:
     """Return the slice at half the height of the seen objects, on a table at z = 0."""
     points, labels = seen.points()

@@ -13,7 +13,6 @@ from oracles import dense_em, ray_oracles
 from oracles.small_scenes import small_scene
 
 from experiments.baselines import METHODS, method, octomap, sgd, sigmoid, voxel
-from experiments.baselines.meshing import meshes_of
 from experiments.baselines.pointsdf import weights as pointsdf_weights
 from vprism_plan._kernels import rays
 from vprism_plan.errors import ConfigError, MapError, ObservationError
@@ -202,7 +201,8 @@ def test_voxels_hold_what_was_seen_and_nothing_under_the_table(fitted, observati
     proba = found.predict_proba(seen[high])
     # Two objects, or an object and a stray pixel, may share a voxel.
     assert (proba[np.arange(high.sum()), np.searchsorted((0, 2, 5), labels[high])]).mean() > 0.99
-    lower, upper = found.support_bounds()
+    lower = found.edge * (found.first - 0.5)
+    upper = lower + found.edge * np.array(found.classes.shape)
     outside = np.array([lower - 0.001, upper + 0.001])
     assert (found.predict_proba(outside)[:, 0] == 1.0).all()
 
@@ -337,48 +337,3 @@ def test_the_point_estimate_is_a_softmax_and_fits_its_data(fitted, points):
 
 
 # ------------------------------------------------------------------ meshes
-class Balls:
-    """Two balls whose probability falls with the distance from their surfaces."""
-
-    object_ids = (3, 4)
-    centers = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
-
-    def predict_proba(self, points):
-        gap = np.linalg.norm(points[:, None] - self.centers, axis=2) - np.array([0.05, 0.02])
-        own = 0.6 / (1.0 + np.exp(100.0 * gap))
-        return np.column_stack([1.0 - own.sum(axis=1), own])
-
-
-def test_meshes_close_around_each_objects_level_set():
-    box = ((-0.1, -0.1, -0.1), (0.3, 0.1, 0.1))
-    meshes = meshes_of(Balls(), 0.3, 0.005, bounds=box)
-    assert list(meshes) == [3, 4]
-    for mesh, radius, center in zip(meshes.values(), (0.05, 0.02), Balls.centers, strict=True):
-        assert mesh.is_watertight
-        assert mesh.volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.06)
-        np.testing.assert_allclose(
-            np.linalg.norm(mesh.vertices - center, axis=1), radius, atol=5e-4
-        )
-    half = meshes_of(Balls(), 0.3, 0.005, bounds=((-0.1, -0.1, 0.0), (0.1, 0.1, 0.1)))
-    assert list(half) == [3]
-    assert half[3].is_watertight
-    assert meshes_of(Balls(), 0.7, 0.01, bounds=box) == {}
-
-
-def test_meshes_of_methods_are_watertight(fitted):
-    for key in ("voxel", "vprism-paper", "octomap"):
-        meshes = meshes_of(fitted(key), method(key).level)
-        assert set(meshes) <= {2, 5}
-        assert meshes
-        assert all(mesh.is_watertight for mesh in meshes.values())
-
-
-def test_meshing_says_what_it_needs():
-    with pytest.raises(ConfigError, match="Balls does not say"):
-        meshes_of(Balls())
-    with pytest.raises(ConfigError, match="lower coordinate"):
-        meshes_of(Balls(), bounds=((0, 0, 0), (1, 1, 0)))
-    with pytest.raises(ConfigError, match="resolution"):
-        meshes_of(Balls(), 0.5, 0.0)
-    with pytest.raises(ConfigError, match="samples"):
-        meshes_of(Balls(), 0.5, 0.001, bounds=((0, 0, 0), (9, 9, 9)))

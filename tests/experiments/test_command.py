@@ -24,7 +24,7 @@ def checkout(tmp_path, monkeypatch):
     planning = {"about": {"kinds": {"analytic": 4, "ycb": 4, "random": 4}}}
     for table, page in (("baselines", sets), ("uncertainty", sets), ("planning", planning)):
         (results / f"{table}.json").write_text(json.dumps(page))
-    monkeypatch.setattr(command, "_checkout", lambda: tmp_path)
+    monkeypatch.setattr(command, "__file__", str(tmp_path / "experiments" / "__main__.py"))
     return results
 
 
@@ -49,7 +49,12 @@ def test_a_short_run_replaced_the_page_of_a_long_one(words, scenes, checkout, ca
 
 def test_as_many_scenes_or_a_folder_by_name_may_replace_a_page(checkout, monkeypatch):
     ran = []
-    monkeypatch.setattr(command, "_reconstruction", lambda *a: ran.append(a[-1]) or ({}, [], []))
+
+    def reconstruction(table, methods, asked):
+        ran.append(asked["output"])
+        return {}, [], []
+
+    monkeypatch.setattr(command, "_reconstruction", reconstruction)
     assert main(["baselines", "--scenes", "4"]) == 0
     assert main(["baselines", "--scenes", "1", "--output", str(checkout)]) == 0
     assert main(["presets", "--scenes", "1"]) == 0  # no page yet

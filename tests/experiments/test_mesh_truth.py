@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from experiments.generation import MeshObject, MeshScene
 from experiments.generation.raycasting import observe
-from experiments.generation.truth import MeshTruth, checked_points
+from experiments.generation.truth import MeshTruth
+from experiments.protocols import checked_points
 from vprism_plan.errors import ConfigError
 from vprism_plan.simulation import Box, Camera, Frustum
 
@@ -109,7 +110,7 @@ def test_points_that_are_none_are_named():
         scene.signed_distance(points)
     assert scene.object_of(np.zeros((0, 3))).shape == (0,)
     assert scene.signed_distance(np.zeros((0, 3))).shape == (0,)
-    assert checked_points([[0, 0, 1]]).dtype == np.float64
+    assert checked_points([[0, 0, 1]], ConfigError).dtype == np.float64
 
 
 def test_a_view_that_misses_every_object():

@@ -10,12 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from oracles import calibration_oracle as oracle
 
-from experiments.metrics import (
-    Reliability,
-    brier_score,
-    expected_calibration_error,
-    object_iou,
-)
+from experiments.metrics import Reliability, object_iou
 from vprism_plan.errors import ConfigError
 
 # Multiples of 1/64 lie on no rounding error: a bin's edge is in the same bin on both sides.
@@ -25,11 +20,9 @@ CASES = st.lists(st.tuples(st.integers(0, 64), st.booleans()), min_size=1, max_s
 @given(cases=CASES, bins=st.sampled_from([1, 2, 4, 8, 16]))
 def test_scores_are_those_of_the_definition(cases, bins):
     p, y = [k / 64 for k, _ in cases], [happened for _, happened in cases]
-    assert brier_score(np.array(p), np.array(y)) == pytest.approx(oracle.brier(p, y), abs=1e-12)
-    assert expected_calibration_error(np.array(p), np.array(y), bins) == pytest.approx(
-        oracle.ece(p, y, bins), abs=1e-12
-    )
     table = Reliability.of(np.array(p), np.array(y), bins)
+    assert table.brier == pytest.approx(oracle.brier(p, y), abs=1e-12)
+    assert table.ece == pytest.approx(oracle.ece(p, y, bins), abs=1e-12)
     assert table.n == sum(row.count for row in table.rows()) == len(p)
     assert table.mean_observed == pytest.approx(np.mean(y))
     assert table.mean_predicted == pytest.approx(np.mean(p))
@@ -48,9 +41,9 @@ def test_tables_add_up(cases, cut):
 
 def test_a_perfect_and_a_hopeless_forecast():
     y = np.array([True, False, True, True])
-    assert expected_calibration_error(y.astype(float), y) == 0.0
-    assert brier_score(y.astype(float), y) == 0.0
-    assert expected_calibration_error(1.0 - y, y) == 1.0
+    perfect = Reliability.of(y.astype(float), y)
+    assert (perfect.ece, perfect.brier) == (0.0, 0.0)
+    assert Reliability.of(1.0 - y, y).ece == 1.0
 
 
 @pytest.mark.parametrize(("k", "n"), [(0, 12), (3, 12), (12, 12)])

@@ -223,6 +223,7 @@ def stub_sweeps(monkeypatch, offers, fails=()):
         return [{"contender": c.asked["contender"]["key"], "seed": c.asked["seed"]} for c in cases]
 
     monkeypatch.setattr(running, "sweep", sweep)
+    monkeypatch.setattr("experiments.tables.sweep.sweep", sweep)
 
 
 def test_scenes_that_offer_too_few_problems_are_replaced_and_named(tmp_path, monkeypatch):

@@ -14,6 +14,7 @@ from experiments.baselines import METHODS
 from experiments.protocols import Method
 from experiments.tables import intervals, pictures, scoring
 from experiments.tables import reconstruction as tables
+from experiments.tables.results import summary
 from experiments.tables.sweep import SweepInputError
 from vprism_plan.errors import ConfigError, MapError
 from vprism_plan.simulation.camera import Camera
@@ -133,7 +134,7 @@ def test_the_report_says_what_the_json_says(stubs, tmp_path):
     ]  # fmt: skip
     figures = json.loads(files[-2].read_text())
     text = files[-1].read_text()
-    assert figures == json.loads(json.dumps(tables.summary(results)))
+    assert figures == json.loads(json.dumps(summary(results)))
     assert "seeds 5 to 7" in text
     assert "python -m experiments baselines" in text
     assert re.search(r"commit ([0-9a-f]{10}\+?|unknown)", text)

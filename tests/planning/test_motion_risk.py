@@ -20,8 +20,8 @@ from vprism_plan.planning import (
     state_space,
     to_state,
 )
-from vprism_plan.planning._motion_risk import MotionRisk
 from vprism_plan.planning.goals import solve_region
+from vprism_plan.planning.objectives import MotionRisk
 from vprism_plan.robots import Robot
 
 
@@ -48,7 +48,7 @@ def motions(checker):
     for place in places[rng.choice(len(places), 12)]:
         region = ReachRegion.sphere(place, 0.12, link="panda_hand")
         few = PoseGoalConfig(attempts=24, iterations=20)
-        near = solve_region(checker.robot, region, np.zeros(7), 0, few).reached
+        near = solve_region(checker.robot, region, np.zeros(7), 0, few)
         unsure += [q for q in near if 0.0 < risk.state(q) < 3.0]
     assert len(unsure) >= 4
     pairs = []

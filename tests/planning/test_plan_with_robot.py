@@ -137,7 +137,7 @@ def test_a_pose_inside_an_obstacle_says_what_is_touched(arm):
 def test_a_pose_that_is_none_and_a_link_that_is_none_are_refused(arm, crowded):
     skewed = np.eye(4)
     skewed[0, 1] = 0.5
-    with pytest.raises(PlanningError, match="not a rigid transform"):
+    with pytest.raises(PlanningError, match="goal pose is not rigid"):
         plan(crowded, START, skewed)
     with pytest.raises(PlanningError, match=r"no link 'hand'.*tool0"):
         plan(crowded, START, np.eye(4), pose_goal=PoseGoalConfig(link="hand"))

@@ -92,8 +92,7 @@ def test_states_of_a_lead_are_nearest_to_the_one_before():
     """At most a tenth of a step apart: what is nearest past a thin wall is on this side."""
     si = ob.SpaceInformation(state_space(disk_world.robot()))
     lead = np.array([(-0.8, -0.8), (-0.5, 0.6), (-0.3, 0.6), (-0.1, -0.6), (0.1, -0.6)])
-    guided = GuidedGoal(si, lead[-1:], 0, 0.5)
-    guided.lead(lead)
+    guided = GuidedGoal(si, lead[-1:], 0, 0.5, lead)
     rows = np.array([lead[0], *guided._queue[::-1]])
     assert np.linalg.norm(np.diff(rows, axis=0), axis=1).max() <= 0.05 + 1e-9
     for k in range(1, len(rows)):

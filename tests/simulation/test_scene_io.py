@@ -2,14 +2,17 @@
 """A saved scene keeps the view and the truth apart, and both exact."""
 
 import filecmp
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import vprism_plan
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import load_observation
-from vprism_plan.simulation import load_ground_truth, random_scene, save_scene
-from vprism_plan.simulation.make_demo_scene import BUNDLED, main
+from vprism_plan.simulation import demo_scene, load_ground_truth, random_scene, save_scene
+
+BUNDLED = Path(vprism_plan.__file__).parent / "data" / "demo_scene"
 
 
 @pytest.mark.parametrize("name", ["scene", "scene.npz"])
@@ -31,8 +34,8 @@ def test_missing_truth_is_named(tmp_path):
         load_ground_truth(tmp_path)
 
 
-def test_bundled_scene_is_what_the_script_writes(tmp_path):
-    main(tmp_path / "again")
+def test_bundled_scene_is_the_demo_scene_saved(tmp_path):
+    save_scene(demo_scene(), tmp_path / "again")
     names = sorted(p.name for p in BUNDLED.iterdir())
     assert "ground_truth.json" in names
     assert "depth.png" in names

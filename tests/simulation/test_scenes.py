@@ -15,7 +15,7 @@ from vprism_plan.simulation import (
     random_scene,
     render,
 )
-from vprism_plan.simulation.placement import clearance_between
+from vprism_plan.simulation.scenes import clearance_between
 
 
 def tilted(seed: int) -> np.ndarray:

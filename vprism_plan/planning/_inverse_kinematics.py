@@ -45,16 +45,10 @@ class Tip:
 
 
 def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
-    """Find the frame a link is attached to: the deepest one it does not move against.
-
-    Raises PlanningError if the robot has no kinematics or no such link, or None is asked for
-    and no link is recognisable as the end effector.
-    """
+    """Find the frame a link, or the end effector, is attached to; PlanningError without one."""
     if not (hasattr(robot, "arrays") and hasattr(robot, "link_poses")):
-        raise PlanningError(
-            f"a {type(robot).__name__} has no kinematics to solve a pose with; "
-            "give the goal as joint values"
-        )
+        who = type(robot).__name__
+        raise PlanningError(f"a {who} has no kinematics; give the goal as joint values")
     parent = robot.arrays.parent
     two = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
     links = [robot.link_poses(q) for q in two]
@@ -63,29 +57,23 @@ def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
     if link is None:
         endings = [(n, e) for e in _TIP_NAMES for n in reversed(links[0])]
         name = next((n for n, e in endings if n == e or n.endswith("_" + e)), None)
+    known = ", ".join(links[0])
     if name is None:
-        raise PlanningError(
-            "no link is recognisable as the end effector; name one (`link`): " + ", ".join(links[0])
-        )
+        raise PlanningError(f"no link looks like the end effector; name one (`link`): {known}")
     if name not in links[0]:
-        raise PlanningError(
-            f"{robot.name} has no link {name!r}; its links are {', '.join(links[0])}"
-        )
-    for frame in reversed(range(len(parent))):
-        offsets = [_rigid_inverse(R[i, frame], t[i, frame]) @ links[i][name] for i in (0, 1)]
+        raise PlanningError(f"{robot.name} has no link {name!r}; its links are {known}")
+    for frame in reversed(range(len(parent))):  # the deepest one that it does not move against
+        inverses = np.tile(np.eye(4), (2, 1, 1))
+        for i, inverse in enumerate(inverses):
+            inverse[:3, :3] = R[i, frame].T
+            inverse[:3, 3] = -R[i, frame].T @ t[i, frame]
+        offsets = [inverse @ links[i][name] for i, inverse in enumerate(inverses)]
         if np.allclose(offsets[0], offsets[1], atol=1e-9):
             chain = [frame] if frame > 0 else []
             while chain and parent[chain[-1]] > 0:
                 chain.append(int(parent[chain[-1]]))
             return Tip(frame, offsets[0], tuple(chain))
     raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
-
-
-def _rigid_inverse(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = R.T
-    T[:3, 3] = -R.T @ t
-    return T
 
 
 def descend(

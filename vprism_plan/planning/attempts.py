@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a query to a verified path: search, shorten, verify, and search again where that fails.
 
-An edge that the search accepted may be refused when it is verified: then another seed is tried
-(`searched`). And the whole path may be too risky although each of its edges is within the
-bound: then all is done again with a stricter one (`within_risk`).
+A verification may refuse what the search accepted (`searched`), and a whole path may be too
+risky although each of its edges is within the bound (`within_risk`): then it is tried again.
 """
 
 import time
@@ -93,7 +92,6 @@ class Query:
     simplify_time: float
     interpolate: float | None
     clearance_step: float
-    now: Now
 
     def shortened(
         self, checker: CheckerLike, path: Waypoints, report: PlanReport
@@ -101,14 +99,15 @@ class Query:
         """Return the path with fewer detours, and the report with what that took."""
         if not self.simplify:
             return path, report
-        began = self.now()
+        now = self.request.now
+        began = now()
         check = MotionCheck(checker)
         end = began + self.simplify_time
-        path = shorten(path, check, report.seed, end, self.now, self.cost)
+        path = shorten(path, check, report.seed, end, now, self.cost)
         if self.cost is not None:
-            path = cheapen(path, check, report.seed, end, self.now, self.cost)
-            path = shorten(path, check, report.seed, end, self.now, self.cost)
-        took = report.simplification_time + self.now() - began
+            path = cheapen(path, check, report.seed, end, now, self.cost)
+            path = shorten(path, check, report.seed, end, now, self.cost)
+        took = report.simplification_time + now() - began
         checks = report.motion_checks + check.count
         return path, replace(report, simplification_time=took, motion_checks=checks)
 
@@ -116,7 +115,7 @@ class Query:
         """Return the verdict on a path with the waypoints that were asked for."""
         if self.interpolate is not None:
             path = resample(path, MotionCheck(checker), self.interpolate)
-        return verified(checker, path, self.clearance_step, report, self.now)
+        return verified(checker, path, self.clearance_step, report, self.request.now)
 
 
 def attempt(
@@ -181,7 +180,7 @@ def _led(
     checker: CheckerLike, query: Query, request: SearchRequest, lead: Lead | None
 ) -> SearchOutcome:
     """Search, led along a known path if that is wanted: the given one, or RRTConnect's."""
-    start, goals, cost, now = query.start, query.goals, query.cost, query.now
+    start, goals, cost, now = query.start, query.goals, query.cost, request.now
     if cost is None or not query.warm_start or not planner_kind(request.planner).goal_bias:
         found = search(checker, start, goals, request, cost)
         if found.status == "exact" or lead is None:

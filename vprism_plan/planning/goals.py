@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from vprism_plan._arguments import number, rigid_pose, whole
 from vprism_plan.errors import PlanningError, RobotError
 from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip
 from vprism_plan.planning.ompl_adapter import nearest_turns
-from vprism_plan.planning.path import one_line
+from vprism_plan.planning.path import one_line, outside_limits
 from vprism_plan.planning.protocols import CheckerLike, Configuration
 from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
 from vprism_plan.robots.kinematics import frame_poses, joint_values
@@ -45,11 +46,10 @@ class PoseGoalConfig:
 
     def __post_init__(self) -> None:
         for name in ("attempts", "iterations", "max_goals"):
-            if getattr(self, name) < 1:
-                raise PlanningError(f"{name} is {getattr(self, name)!r}; it must be at least 1")
+            whole(name, getattr(self, name), 1, error=PlanningError)
         for name in ("position_tolerance", "rotation_tolerance"):
-            if not getattr(self, name) > 0.0:
-                raise PlanningError(f"{name} is {getattr(self, name)!r}; it must be more than 0")
+            value = getattr(self, name)
+            number(name, value, 0.0, above=True, finite=False, error=PlanningError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,22 +81,17 @@ class ReachRegion:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "pose", np.array(self.pose, dtype=np.float64))
-        require_rigid(self.pose, "pose of a region")
+        set_(self, "pose", rigid_pose("pose of a region", self.pose, error=PlanningError))
         extent = np.atleast_1d(np.array(self.extent, dtype=np.float64))
         if extent.shape not in {(1,), (3,)} or not (np.isfinite(extent) & (extent >= 0.0)).all():
-            raise PlanningError(
-                f"extent is {self.extent!r}; it must be one radius or three half edges, metres, "
-                "finite and not negative"
-            )
+            needed = "one radius or three half edges, metres, finite and not negative"
+            raise PlanningError(f"extent is {self.extent!r}; it must be {needed}")
         set_(self, "extent", extent)
         if self.rotation is not None:
-            whole = np.eye(4)
-            whole[:3, :3] = self.rotation
-            require_rigid(whole, "rotation")
-            set_(self, "rotation", whole[:3, :3])
-        if not (math.isfinite(self.tilt) and 0.0 < self.tilt <= math.pi):
-            raise PlanningError(f"tilt is {self.tilt!r}; it must be more than 0 and at most pi")
+            turned = np.eye(4)
+            turned[:3, :3] = self.rotation
+            set_(self, "rotation", rigid_pose("rotation", turned, error=PlanningError)[:3, :3])
+        number("tilt", self.tilt, 0.0, math.pi, "radians", above=True, error=PlanningError)
         if self.free_axis is not None:
             axis = np.array(self.free_axis, dtype=np.float64)
             length = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
@@ -119,10 +114,10 @@ class ReachRegion:
     @classmethod
     def sphere(cls, center: ArrayLike, radius: float, **others: Any) -> "ReachRegion":
         """Return the ball around a point (3,), world, metres; `others` as the attributes."""
-        pose = np.eye(4)
         middle = np.array(center, dtype=np.float64)
         if middle.shape != (3,):
             raise PlanningError(f"center is {center!r}; it must be a point (3,)")
+        pose = np.eye(4)
         pose[:3, 3] = middle
         return cls(pose, np.array([radius]), **others)
 
@@ -137,17 +132,13 @@ class ReachRegion:
             inside = (np.abs(local) <= self.extent + 1e-9).all(axis=1)
         if self.rotation is None:
             return inside
-        return inside & (self._off(rotations) <= self.tilt + 1e-9)
-
-    def _off(self, rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-        """Angle to the wanted orientation, radians."""
-        assert self.rotation is not None
         if self.free_axis is None:
             turns = Rotation.from_matrix(self.rotation @ rotations.transpose(0, 2, 1))
-            return np.asarray(turns.magnitude())
-        now, wanted = rotations @ self.free_axis, self.rotation @ self.free_axis
-        sine = np.linalg.norm(np.cross(now, wanted), axis=1)
-        return np.arctan2(sine, now @ wanted)
+            angle = np.asarray(turns.magnitude())
+        else:
+            now, wanted = rotations @ self.free_axis, self.rotation @ self.free_axis
+            angle = np.arctan2(np.linalg.norm(np.cross(now, wanted), axis=1), now @ wanted)
+        return inside & (angle <= self.tilt + 1e-9)
 
     def draw(self, n: int, rng: np.random.Generator) -> Targets:
         """Draw targets, places uniform in the region, orientations within half the tilt."""
@@ -167,40 +158,33 @@ class ReachRegion:
         return Targets(positions, rotations, self.free_axis)
 
 
-@dataclass(frozen=True)
-class GoalSolutions:
-    """Configurations found for a pose or a region, of how many attempts."""
-
-    reached: np.ndarray  # (n, dof) distinct, nearest to the reference first, not yet checked
-    attempts: int
-
-
 def solve_pose(
     robot: Any, pose: np.ndarray, reference: Configuration, seed: int, config: PoseGoalConfig
-) -> GoalSolutions:
+) -> Float[np.ndarray, "n dof"]:
     """Find configurations that bring a link to a pose (4, 4) in the world, metres.
 
-    From `reference`, and random starts within the joint limits, in float64, with mimic and
-    continuous joints. (pytorch-kinematics' solver reads its offsets in float32 and leaves mimic
-    joints out: `experiments.benchmarks.inverse_kinematics`.) Raises PlanningError if the pose
-    is not a rigid transform, or the link is unknown.
+    They are distinct, nearest to `reference` first, and not yet checked. The solver starts there
+    and at random within the joint limits, in float64, with mimic and continuous joints.
+    (pytorch-kinematics' reads its offsets in float32 and leaves mimic joints out:
+    `experiments.benchmarks.inverse_kinematics`.) Raises PlanningError for what is no rigid
+    transform, or an unknown link.
     """
-    require_rigid(pose, "goal pose")
+    pose = rigid_pose("goal pose", pose, error=PlanningError)
     n = config.attempts
     targets = Targets(np.tile(pose[:3, 3], (n, 1)), np.tile(pose[:3, :3], (n, 1, 1)))
     _, q, away, turn = _descended(robot, config.link, lambda _: targets, reference, seed, config)
     good = (away <= config.position_tolerance) & (turn <= config.rotation_tolerance)
-    return GoalSolutions(_distinct(robot, q[good], reference), n)
+    return _distinct(robot, q[good], reference)
 
 
 def solve_region(
     robot: Any, region: ReachRegion, reference: Configuration, seed: int, config: PoseGoalConfig
-) -> GoalSolutions:
+) -> Float[np.ndarray, "n dof"]:
     """Find configurations that bring a link into a region; arguments as `solve_pose`."""
     n, link = config.attempts, region.link or config.link
     tip, q, _, _ = _descended(robot, link, lambda rng: region.draw(n, rng), reference, seed, config)
     good = region.contains(*tip.behind(*frame_poses(robot.arrays, q)))
-    return GoalSolutions(_distinct(robot, q[good], reference), n)
+    return _distinct(robot, q[good], reference)
 
 
 def _descended(
@@ -211,7 +195,7 @@ def _descended(
     seed: int,
     config: PoseGoalConfig,
 ) -> tuple[Tip, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the link, and what `descend` makes of the reference and random starts."""
+    """The link, and what `descend` makes of the reference and random starts."""
     rng = np.random.default_rng(seed)
     tip = find_tip(robot, link, np.random.default_rng(seed))
     lower, upper = np.asarray(robot.lower), np.asarray(robot.upper)
@@ -232,38 +216,18 @@ def _distinct(
     return np.array(kept).reshape(-1, q.shape[1])
 
 
-def require_rigid(pose: np.ndarray, what: str) -> None:
-    """Raise PlanningError unless a matrix is a rigid transform (4, 4)."""
-    rigid = pose.shape == (4, 4) and bool(np.isfinite(pose).all())
-    if rigid:
-        R = pose[:3, :3]
-        rigid = (
-            np.allclose(R @ R.T, np.eye(3), atol=1e-6)
-            and float(np.linalg.det(R)) > 0.0
-            and np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0])
-        )
-    if not rigid:
-        raise PlanningError(
-            f"{what} {pose.tolist()} is not a rigid transform; it needs an orthonormal rotation "
-            "with determinant 1, a translation in metres and the last row 0 0 0 1"
-        )
-
-
 def configuration(q: Any, robot: Any, what: str) -> Configuration:
     """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
     array = _numbers(q, robot, what)
     if array.shape != (robot.dof,):
-        raise PlanningError(
-            f"{what} has shape {array.shape}; it must be ({robot.dof},), one value per joint: "
-            f"{', '.join(robot.joint_names)}"
-        )
+        joints = f"({robot.dof},), one value per joint: {', '.join(robot.joint_names)}"
+        raise PlanningError(f"{what} has shape {array.shape}; it must be {joints}")
     if not np.isfinite(array).all():
         raise PlanningError(f"{what} is {array}; every joint value must be finite")
     return array
 
 
 def _numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
-    """Return a fresh float64 copy, or raise PlanningError naming what cannot be read."""
     try:
         return joint_values(values, robot, what)
     except RobotError as error:
@@ -275,8 +239,8 @@ def refuse(
 ) -> PlanResult | None:
     """Return the refusal if q must not be used as start or goal, None if it may."""
     robot = checker.robot
-    # The limits are checked here too: outside them OMPL would refuse without a reason.
-    bad = ~np.asarray(robot.continuous, dtype=bool) & ((q < robot.lower) | (q > robot.upper))
+    # Outside the limits OMPL would refuse without a reason.
+    bad = outside_limits(robot, q)
     if not bad.any() and checker.is_valid(q):
         return None
     outside = ", ".join(
@@ -285,9 +249,8 @@ def refuse(
         for i in np.flatnonzero(bad)
     )
     explanation = checker.explain(q)
-    reasons = outside if explanation.valid else one_line(explanation)
+    message = f"{what} is invalid: {outside if explanation.valid else one_line(explanation)}"
     status: Any = f"invalid_{what}"
-    message = f"{what} is invalid: {reasons}"
     return PlanResult(None, status, report, message, explanation=explanation)
 
 
@@ -298,11 +261,7 @@ def valid_goals(
     config: PoseGoalConfig,
     report: PlanReport,
 ) -> tuple[Float[np.ndarray, "g dof"], PlanReport] | PlanResult:
-    """Return valid goal configurations (g, dof) and the report of the others, or the refusal.
-
-    Of those that reach a pose or a region as many are kept as `config` allows, of those that
-    the caller gave all.
-    """
+    """Return valid goal configurations (g, dof) and the report of the others, or the refusal."""
     robot = checker.robot
     array = np.empty(0) if isinstance(goal, ReachRegion) else _numbers(goal, robot, "goal")
     if isinstance(goal, ReachRegion):
@@ -310,23 +269,23 @@ def valid_goals(
     elif array.shape == (4, 4) and (robot.dof != 4 or array[3].tolist() == [0.0, 0.0, 0.0, 1.0]):
         what, found = "pose", solve_pose(robot, array, start, report.seed, config)
     elif array.ndim == 2 and len(array) > 0 and array.shape[1] == robot.dof:
-        rows = np.stack([configuration(q, robot, f"goal {k}") for k, q in enumerate(array)])
-        what, found = "", GoalSolutions(rows, len(rows))
+        found = np.stack([configuration(q, robot, f"goal {k}") for k, q in enumerate(array)])
+        what = ""
     else:
         q = configuration(array, robot, "goal")
         refusal = refuse(checker, q, "goal", report)
         return (q[None], report) if refusal is None else refusal
-    if len(found.reached) == 0:
+    if len(found) == 0:
         message = (
             "goal is invalid: no configuration within the joint limits reaches the "
-            f"{what} ({found.attempts} attempts)"
+            f"{what} ({config.attempts} attempts)"
         )
         return PlanResult(None, "invalid_goal", report, message)
     good: list[np.ndarray] = []
     refused: list[PlanResult] = []
     notes: list[RefusedGoal] = []
-    most = config.max_goals if what else len(found.reached)
-    for q in found.reached:
+    most = config.max_goals if what else len(found)  # the caller's own are all kept
+    for q in found:
         refusal = refuse(checker, q, "goal", report)
         if refusal is None:
             good.append(q)
@@ -340,7 +299,5 @@ def valid_goals(
     if good:
         return np.array(good), report
     said = f"found for the goal {what}" if what else "given as goals"
-    message = (
-        f"all {len(found.reached)} configurations {said} are invalid, the first: {notes[0].reason}"
-    )
+    message = f"all {len(found)} configurations {said} are invalid, the first: {notes[0].reason}"
     return replace(refused[0], report=report, message=message)

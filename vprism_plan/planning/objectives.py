@@ -11,19 +11,32 @@ Neither keeps `si`, which would close a reference cycle through the binding.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
+from jaxtyping import Float, Int
 from ompl import base as ob
 
+from vprism_plan._arguments import choice, number
+from vprism_plan._kernels import objectives as kernels
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning._motion_risk import KINDS, MotionRisk, preparation
 from vprism_plan.planning.ompl_adapter import StateReader, nearest_turns
 from vprism_plan.planning.protocols import Configuration, Waypoints
 
 # Rates (n,) per metre at configurations (n, dof).
 Rates = Callable[[np.ndarray], np.ndarray]
+KINDS: tuple[str, ...] = ("survival", "joint", "occupancy", "entropy")
+_OF_FIELDS = ("occupancy", "entropy")
+
+_PAD = 0.25  # metres around what is uncertain in which distances to it are known
+_LEAST = 1e-3  # probability, or nats, below which a field counts as 0
+_MOST_KEPT = 200_000  # motions whose cost is remembered
+# The middle of a ball, and its surface towards the faces and the corners of a cube.
+_AXES = np.concatenate([np.eye(3), -np.eye(3)])
+_CORNERS = np.array(list(product((-1.0, 1.0), repeat=3))) / np.sqrt(3.0)
+_POINTS = np.concatenate([np.zeros((1, 3)), _AXES, _CORNERS])
 
 
 @dataclass(frozen=True)
@@ -46,16 +59,10 @@ class RiskObjective:
     worst: bool = False
 
     def __post_init__(self) -> None:
-        if not callable(self.kind) and self.kind not in KINDS:
-            raise PlanningError(
-                f"kind is {self.kind!r}; valid kinds of risk are {', '.join(KINDS)}, or a function"
-            )
-        if not (math.isfinite(self.length_weight) and self.length_weight >= 0.0):
-            raise PlanningError(
-                f"length_weight is {self.length_weight!r}; it must be finite and at least 0"
-            )
-        if not (math.isfinite(self.spacing) and self.spacing > 0.0):
-            raise PlanningError(f"spacing is {self.spacing!r}; it must be finite and more than 0")
+        if not callable(self.kind):
+            choice("kind, if no function,", self.kind, KINDS, error=PlanningError)
+        number("length_weight", self.length_weight, 0.0, error=PlanningError)
+        number("spacing", self.spacing, 0.0, unit="metres", above=True, error=PlanningError)
 
     @property
     def name(self) -> str:
@@ -68,15 +75,176 @@ class RiskObjective:
         return preparation(checker, self.kind) if isinstance(self.kind, str) else ()
 
     def cost(self, checker: Any) -> "PathCost":
-        """Return what paths of a checker's robot cost; draws worlds if nobody has.
-
-        Where worlds are asked about, they are baked then: by the search, within its limit.
-        """
+        """Return what paths of a checker's robot cost; draws worlds if nobody has."""
         return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
 
 
+class MotionRisk:
+    """The risk of motions and configurations of one checker's robot, by one of the kinds.
+
+    Motions are sampled so that no sphere centre moves more than `spacing` between samples;
+    stretches that are far from anything uncertain are skipped. All samples of a motion are
+    worked through in one compiled call, and its cost is remembered.
+
+    `VPrismRiskObjective` says what the kinds are. p of "survival" is a bound from above of the
+    marginal that `checker.collision_probability(q)` gives. Integrals are by the trapezoidal
+    rule. "joint", summed over a path's edges, bounds -log(1 - risk) of the path if touching on
+    one edge does not make touching on another less likely.
+    """
+
+    def __init__(self, checker: Any, kind: str, spacing: float) -> None:
+        choice("kind", kind, KINDS, error=PlanningError)
+        number("spacing", spacing, 1e-3, 0.5, "metres", error=PlanningError)
+        for step in preparation(checker, kind):
+            step()
+        self.kind = kind
+        self.spacing = float(spacing)
+        self._at = checker.risk_setting()
+        worlds = self._at.worlds
+        self._possible, self._corner = _possible(worlds)
+        self._rates = np.empty(self._at.ints[2])
+        self._delta = np.empty(self._at.ints[4])
+        self._kept: dict[tuple[bytes, bytes], float] = {}
+        self._ceiling = 1.0 - 0.5 / worlds.n_worlds  # p = 1 must stay finite
+        self._touched = np.zeros(worlds.n_worlds, np.uint8)
+        if kind in _OF_FIELDS:
+            self._field = _field(worlds, self._at.world, kind)
+            # 1 per sphere of the moving links, or its share of their volume.
+            self._weights = (self._at.sphere_tables >= 0).astype(np.float64)
+            if kind == "entropy":
+                self._weights *= self._at.radii**3
+                self._weights /= max(float(self._weights.sum()), 1e-300)
+            self._directions = _POINTS if kind == "occupancy" else 0.8 * _POINTS
+        self._marks = worlds.new_marks()
+        # Asked once without a sphere, so that nothing compiles inside a planner's time limit.
+        q, self._tables = np.zeros(len(self._delta)), np.full_like(self._at.sphere_tables, -1)
+        self._sweep(q, q)
+        self._tables = self._at.sphere_tables
+
+    def motion(self, qa: Configuration, qb: Configuration) -> float:
+        """Return the cost of the straight motion, either way."""
+        a, b = qa.tobytes(), qb.tobytes()
+        if a > b:  # in one order, so that both directions cost the same to the last bit
+            a, b, qa, qb = b, a, qb, qa
+        cost = self._kept.get((a, b))
+        if cost is None:
+            if len(self._kept) >= _MOST_KEPT:
+                self._kept.clear()
+            rates, cost, way = self._sweep(qa, qb)
+            if self.kind != "joint":
+                cost = 0.0
+                if len(rates) > 1 and rates.any():
+                    inner = rates.sum() - 0.5 * (rates[0] + rates[-1])
+                    cost = float(way * (inner / (len(rates) - 1)))
+            self._kept[a, b] = cost
+        return cost
+
+    def state(self, q: Configuration) -> float:
+        """Return the rate at one configuration."""
+        rates, joint, _ = self._sweep(q, q)
+        return joint if self.kind == "joint" else float(rates[0])
+
+    def worst(self, qa: Configuration, qb: Configuration) -> float:
+        """Return the largest rate at the samples of the straight motion, either way."""
+        if self.kind == "joint":
+            return self.motion(qa, qb)
+        a, b = (qa, qb) if qa.tobytes() <= qb.tobytes() else (qb, qa)
+        return float(self._sweep(a, b)[0].max())
+
+    def _sweep(self, qa: np.ndarray, qb: np.ndarray) -> tuple[np.ndarray, float, float]:
+        """Rates at the samples, -log of the share of worlds touched nowhere, bound on the way."""
+        at, worlds = self._at, self._at.worlds
+        steps, way, turned = kernels.plan_steps(
+            qa, qb, at.floats, at.ints, self.spacing, self._delta, self._rates
+        )
+        if self.kind in _OF_FIELDS:
+            values = np.empty(steps + 1)
+            kernels.sweep_field(
+                qa, self._delta, steps, self._rates, at.floats, at.ints, at.radii, self._weights,
+                self._possible, self._corner, worlds.resolution, self._field[0], self._field[1],
+                self._directions, self.kind == "occupancy", values,
+            )  # fmt: skip
+            return values, 0.0, way
+        counts = np.empty(steps + 1, np.int64)
+        scale, reach = worlds.scale
+        while True:
+            tables = worlds.tables
+            missing = kernels.sweep_draws(
+                qa, self._delta, steps, self._rates, turned, at.floats, at.ints, at.radii,
+                self._tables, self._possible, self._corner, worlds.resolution,
+                tables.distance_row, tables.rows, tables.lowest, worlds.first, scale, reach,
+                counts, self._touched, self._marks,
+            )  # fmt: skip
+            if not missing:
+                break
+            worlds.bake_marked(self._marks)
+            self._marks = worlds.new_marks()
+        n = len(self._touched)
+        joint = -math.log1p(-min(int(self._touched.sum()) / n, self._ceiling))
+        return -np.log1p(-np.minimum(counts / n, self._ceiling)), joint, way
+
+
+def preparation(checker: Any, kind: str) -> tuple[Callable[[], Any], ...]:
+    """The long parts of making a `MotionRisk`, in turn; what one has done is kept."""
+    if not hasattr(checker, "risk_setting"):
+        other = "a CollisionChecker over a World, or a function as the kind of risk"
+        raise PlanningError(f"a {type(checker).__name__} has no posterior; give {other}")
+
+    def worlds() -> Any:
+        return checker.risk_setting().worlds
+
+    if kind in _OF_FIELDS:
+        return worlds, lambda: _possible(worlds()), lambda: _field(worlds(), checker.world, kind)
+    return worlds, lambda: worlds().sample(), lambda: _possible(worlds())
+
+
+Grid = tuple[Float[np.ndarray, "x y z"], Int[np.ndarray, " 3"]]  # values, first index
+# Baking takes longer than many a search, so objectives over one map share it.
+_baked: WeakKeyDictionary[Any, dict[str, Grid]] = WeakKeyDictionary()
+
+
+def _possible(worlds: Any) -> Grid:
+    """Distance, voxels, from voxel centres to the nearest that any draw may occupy; first index."""
+    kept = _baked.setdefault(worlds, {})
+    if "possible" not in kept:
+        from scipy import ndimage
+
+        row, _, first = worlds.owner_tables
+        filled = np.argwhere(row >= 0)
+        if len(filled) == 0:
+            kept["possible"] = np.full((1, 1, 1), 1e6, np.float32), np.zeros(3, np.int64)
+        else:
+            low, high = filled.min(axis=0), filled.max(axis=0) + 1
+            pad = math.ceil(_PAD / worlds.resolution)
+            inside = row[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] >= 0
+            away = ndimage.distance_transform_edt(~np.pad(inside, pad))
+            corner = np.asarray(first + low - pad, dtype=np.int64)
+            kept["possible"] = away.astype(np.float32), corner
+    return kept["possible"]
+
+
+def _field(worlds: Any, world: Any, kind: str) -> Grid:
+    """P(occupied), or entropy in nats, at the voxel centres of the posterior worlds."""
+    kept = _baked.setdefault(worlds, {})
+    if kind not in kept:
+        row, _, first = worlds.owner_tables
+        first = np.asarray(first, dtype=np.int64)
+        drawn = np.argwhere(row >= len(world.map.object_ids))
+        points = worlds.resolution * (drawn + first)
+        field = np.zeros(row.shape, np.float32)
+        if kind == "occupancy":
+            field[row >= 0] = 1.0
+            values = np.asarray(world.map.occupancy(points))
+        else:
+            values = np.asarray(world.map.entropy(points))
+            values[np.asarray(world.map.support(points)) < world.config.min_support] = 0.0
+        field[tuple(drawn.T)] = np.where(values < _LEAST, 0.0, values)
+        kept[kind] = field, first
+    return kept[kind]
+
+
 class _FunctionRisk:
-    """`MotionRisk` for rates that a user's function gives; "metres" are those of joint space."""
+    """`MotionRisk` for a user's rates; "metres" are those of joint space."""
 
     def __init__(self, rates: Rates, spacing: float) -> None:
         self._rates, self._spacing = rates, spacing
@@ -100,17 +268,14 @@ class _FunctionRisk:
     def _checked(self, Q: np.ndarray) -> np.ndarray:
         """Return the rates at rows of Q; planners crash the process over negative costs."""
         rates = np.asarray(self._rates(Q), dtype=np.float64)
+        wrong = ""
         if rates.shape != (len(Q),):
-            raise PlanningError(
-                f"the function of the objective returned shape {rates.shape} for "
-                f"configurations {Q.shape}; it must return ({len(Q)},), one rate each"
-            )
-        bad = np.flatnonzero(~(np.isfinite(rates) & (rates >= 0.0)))
-        if len(bad):
-            raise PlanningError(
-                f"the function of the objective returned {rates[bad[0]]} at "
-                f"{Q[bad[0]].tolist()}; rates must be finite and at least 0"
-            )
+            wrong = f"shape {rates.shape} for {Q.shape}; it must be ({len(Q)},), one rate each"
+        elif (bad := ~(np.isfinite(rates) & (rates >= 0.0))).any():
+            k = int(np.argmax(bad))
+            wrong = f"{rates[k]} at {Q[k].tolist()}; rates must be finite and at least 0"
+        if wrong:
+            raise PlanningError(f"the function of the objective returned {wrong}")
         return rates
 
 
@@ -130,11 +295,11 @@ class PathCost:
         worst: bool = False,
     ) -> None:
         RiskObjective(kind, spacing, length_weight, worst)  # refuses what is out of range
-        self.risk: MotionRisk | _FunctionRisk = (
-            MotionRisk(checker, kind, spacing)
-            if isinstance(kind, str)
-            else _FunctionRisk(kind, spacing)
-        )
+        self.risk: MotionRisk | _FunctionRisk
+        if isinstance(kind, str):
+            self.risk = MotionRisk(checker, kind, spacing)
+        else:
+            self.risk = _FunctionRisk(kind, spacing)
         self.length_weight = float(length_weight)
         self.worst = worst
         self._wraps = np.asarray(checker.robot.continuous, dtype=bool)
@@ -154,8 +319,7 @@ class PathCost:
         return max(costs, default=0.0) if self.worst else float(sum(costs))
 
     def _distance(self, step: Configuration) -> float:
-        """Length in `state_space`: Euclidean over each run of limited joints, the angle of each
-        continuous one, all summed."""
+        """Length in `state_space`, which says how."""
         wraps, step = self._wraps, np.abs(step)
         if not wraps.any():
             return float(np.linalg.norm(step))
@@ -207,10 +371,8 @@ class VPrismRiskObjective(_RiskBase):
     Args:
         si: the space information; one dimension per joint, flat order.
         checker: a `CollisionChecker` over a `World`; with a function anything with `robot`.
-        kind: see above.
-        spacing: metres of sphere motion between samples.
-        length_weight: cost per unit of the space's distance; at least 0.
-        cost: in place of the last three, something prepared by `RiskObjective.cost`.
+        kind, spacing, length_weight: as in `RiskObjective`.
+        cost: in place of these, something prepared by `RiskObjective.cost`.
 
     Raises:
         PlanningError: a value out of range, or a checker without a posterior.
@@ -228,7 +390,7 @@ class VPrismRiskObjective(_RiskBase):
         length_weight: float = 1e-3,
         cost: PathCost | None = None,
     ) -> None:
-        cost = PathCost(checker, kind, spacing, length_weight) if cost is None else cost
+        cost = cost or PathCost(checker, kind, spacing, length_weight)
         super().__init__(si, checker, cost)
         self._length_weight = cost.length_weight
 
@@ -261,7 +423,7 @@ class VPrismMinimaxRiskObjective(_RiskBase):
         spacing: float = 0.02,
         cost: PathCost | None = None,
     ) -> None:
-        cost = PathCost(checker, kind, spacing, 0.0, True) if cost is None else cost
+        cost = cost or PathCost(checker, kind, spacing, 0.0, True)
         super().__init__(si, checker, cost)
 
     def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name
@@ -279,10 +441,3 @@ class VPrismMinimaxRiskObjective(_RiskBase):
     def identityCost(self) -> Any:  # noqa: N802 - OMPL's name
         """Return zero, which no rate is below."""
         return ob.Cost(0.0)
-
-
-def make_objective(si: Any, checker: Any, cost: PathCost) -> Any:
-    """Return the OMPL objective for a prepared cost."""
-    if cost.worst:
-        return VPrismMinimaxRiskObjective(si, checker, cost=cost)
-    return VPrismRiskObjective(si, checker, cost=cost)

@@ -59,10 +59,8 @@ def state_space(robot: RobotLike) -> Any:
     upper = np.asarray(robot.upper, dtype=np.float64)
     for name, low, high, free in zip(robot.joint_names, lower, upper, continuous, strict=True):
         if not free and not (np.isfinite(low) and np.isfinite(high) and low < high):
-            raise PlanningError(
-                f"joint {name!r} has limits [{low}, {high}]; a limited joint needs finite limits "
-                "with lower < upper (lock the joint if it should not move)"
-            )
+            needed = "finite ones with lower < upper are needed (lock what should not move)"
+            raise PlanningError(f"joint {name!r} has limits [{low}, {high}]; {needed}")
     if not continuous.any():
         return _real_vector(lower, upper)
     compound = ob.CompoundStateSpace()
@@ -88,10 +86,7 @@ def _real_vector(lower: Float[np.ndarray, " n"], upper: Float[np.ndarray, " n"])
 
 
 def _parts(space: Any, state: Any = None) -> Iterator[tuple[bool, int, Any]]:
-    """Yield of each part, depth first, whether it is a circle, its size, and its state.
-
-    Raises PlanningError for spaces that do not interpolate in straight lines.
-    """
+    """Of each part, depth first: whether it is a circle, its size, its state."""
     # The OMPL class, also behind a user's Python subclass.
     names = (c.__name__ for c in type(space).__mro__ if c.__module__.startswith("ompl."))
     kind = next(names, type(space).__name__)
@@ -101,16 +96,14 @@ def _parts(space: Any, state: Any = None) -> Iterator[tuple[bool, int, Any]]:
         for i, part in enumerate(space.getSubspaces()):
             yield from _parts(part, None if state is None else state[i])
     else:
-        raise PlanningError(
-            f"the state space contains a {kind}; use RealVectorStateSpace, SO2StateSpace, or a "
-            "CompoundStateSpace of them, whose motions are straight lines in joint space"
-        )
+        straight = "RealVectorStateSpace, SO2StateSpace, or a CompoundStateSpace of them"
+        raise PlanningError(f"the state space contains a {kind}; use {straight}")
 
 
 def wrapping_coordinates(space: Any) -> tuple[bool, ...]:
     """Return, per flat coordinate, whether the space wraps it at +-pi (SO2).
 
-    Raises PlanningError for spaces that do not interpolate in straight lines.
+    Raises PlanningError for spaces whose motions are no straight lines.
     """
     return tuple(circle for circle, size, _ in _parts(space) for _ in range(size))
 
@@ -143,10 +136,7 @@ def to_array(space: Any, state: Any) -> Configuration:
 
 
 def to_state(space: Any, q: Configuration) -> Any:
-    """Return a new OMPL state with coordinates q (flat order), SO2 parts wrapped.
-
-    Raises PlanningError if q does not have one finite number per coordinate.
-    """
+    """Return a new OMPL state with finite coordinates q (flat order), SO2 parts wrapped."""
     dof = len(wrapping_coordinates(space))
     values = np.array(q, dtype=np.float64)
     if values.shape != (dof,) or not np.isfinite(values).all():
@@ -171,8 +161,8 @@ def write_state(space: Any, q: Configuration, state: Any) -> None:
             part[i] = next(values)
 
 
-def _capsule(buffer: Float[np.ndarray, " dof"]) -> Any:
-    """Return what lets OMPL write to an array."""
+def _capsule(buffer: Configuration) -> Any:
+    """What lets OMPL write to an array."""
     return _new_capsule(buffer.ctypes.data, _CAPSULE_NAME, None)
 
 
@@ -187,9 +177,8 @@ class _Buffers(threading.local):
 class StateReader:
     """Copies OMPL states of one space into preallocated arrays.
 
-    `fast` says whether states are serialised straight into numpy memory (0.1 microseconds) or
-    read element by element. Buffers are per thread, because a kernel that releases the GIL
-    must not see its input overwritten.
+    `fast`: straight into numpy's memory (0.1 microseconds), not element by element. Buffers are
+    per thread: a kernel that releases the GIL must not see its input overwritten.
     """
 
     def __init__(self, space: Any, dof: int) -> None:
@@ -198,7 +187,7 @@ class StateReader:
         if len(self.wraps) != dof:
             raise PlanningError(
                 f"the state space has {len(self.wraps)} dimensions but the robot has {dof} joints; "
-                "build the space with state_space(robot), or give it one dimension per joint"
+                "make it by state_space(robot)"
             )
         self.space = space
         self.fast = _serialisation_works(space, dof)
@@ -210,7 +199,7 @@ class StateReader:
         return self._copied(state, own.capsule_a, own.a)
 
     def read_pair(self, first: Any, second: Any) -> tuple[Configuration, Configuration]:
-        """Return both buffers of this thread, holding the two states."""
+        """Return both buffers of this thread, holding the states."""
         own = self._buffers
         a = self._copied(first, own.capsule_a, own.a)
         return a, self._copied(second, own.capsule_b, own.b)
@@ -241,10 +230,8 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
     """OMPL's question "is this state valid?", answered by a checker."""
 
     def __init__(self, si: Any, checker: CheckerLike) -> None:
-        """Attach `checker` to the space of `si` (one dimension per joint, flat order).
-
-        Raises PlanningError if dimensions differ or a part is neither RealVector nor SO2.
-        """
+        """Attach `checker` to the space of `si`; PlanningError if that has not one dimension
+        per joint, in flat order, or a part that is neither RealVector nor SO2."""
         super().__init__(si)
         self._reader = StateReader(si.getStateSpace(), checker.robot.dof)
         self._clearance = checker.clearance
@@ -256,10 +243,7 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
         return self._asked()
 
     def isValid(self, state: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
-        """Return whether `state` is valid; exceptions of the checker propagate.
-
-        OMPL dispatches its longer overloads to this name too, hence `*unused`.
-        """
+        """Return whether `state` is valid; OMPL dispatches longer overloads here, too."""
         return self._ask(state)
 
     def clearance(self, state: Any, *unused: Any) -> float:
@@ -270,11 +254,10 @@ class VPrismStateValidityChecker(ob.StateValidityChecker):
 def _question(
     reader: StateReader, is_valid: Callable[[Any], bool]
 ) -> tuple[Callable[[Any], bool], Callable[[], int]]:
-    """Return a function that asks about a state, and one that says how often it was asked.
+    """A function that asks about a state, and one that says how often it was asked.
 
-    This runs for every state a planner samples. Names of a closure are found in half
-    the time of attributes, and comparing thread numbers costs less than thread-local
-    storage: the thread that made the checker has buffers of its own.
+    It runs for every state a planner samples. Names of a closure are found in half the time of
+    attributes, and comparing thread numbers costs less than thread-local storage.
     """
     asked = 0
     owner, buffer = get_ident(), np.zeros(len(reader.wraps))
@@ -313,10 +296,8 @@ class VPrismMotionValidator(ob.MotionValidator):
         self._any_wraps = bool(self._reader.wraps.any())
 
     def checkMotion(self, s1: Any, s2: Any, *unused: Any) -> bool:  # noqa: N802 - OMPL's name
-        """Return whether the straight motion from s1 to s2 is valid, both ends included.
-
-        RRT, RRTstar and KPIECE1 test no other state of the motion themselves.
-        """
+        """Return whether the straight motion is valid, both ends included (RRT, RRTstar and
+        KPIECE1 test no state of it themselves)."""
         self.checks += 1
         qa, qb = self._reader.read_pair(s1, s2)
         if not self._is_valid(qb):
@@ -331,9 +312,9 @@ def last_valid(
 ) -> tuple[Configuration | None, float]:
     """Return how far the straight motion from qa to qb, both (dof,), is certified valid.
 
-    Bisects with `checker.check_motion`, so every part up to the answer is certified, until the
-    interval is `tolerance`, a fraction of the motion. Returns the furthest certified
-    configuration and its fraction in [0, 1]; (None, 0.0) if qa itself is invalid.
+    Bisects with `checker.check_motion` until the interval is `tolerance`, a fraction of the
+    motion. Returns the furthest certified configuration and its fraction in [0, 1]; (None, 0.0)
+    if qa itself is invalid.
     """
     qa = joint_values(qa, checker.robot, "qa")
     qb = joint_values(qb, checker.robot, "qb")

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What becomes of a path that was found: shortened, made cheaper, resampled, verified.
 
-OMPL's `PathSimplifier` cuts accepted edges at points of its choice and keeps the
-pieces unchecked. A checker that samples at its finest step may refuse such a piece by
-microns, and the final verification then refuses the path. Here an edge enters the path
-only as it will be verified: same ends, same direction.
+OMPL's `PathSimplifier` cuts accepted edges and keeps the pieces unchecked, which a checker that
+samples at its finest step may refuse by microns. Here an edge enters the path only as it will
+be verified: same ends, same direction.
 """
 
 import logging
@@ -37,9 +36,9 @@ _MOVE_RANGE = (0.003, 0.6)  # Euclidean in joint space
 class MotionCheck:
     """Counts and answers `checker.check_motion` for edges that may become part of a path.
 
-    An edge that turns a continuous joint by half a turn or more is refused: it means what it
-    says, but others who follow the path could take it for the shorter way round. So is one
-    that leaves the joint limits, which not every checker knows.
+    Refused are also edges that turn a continuous joint by half a turn or more, which others
+    could take for the shorter way round, and those beyond the joint limits, which not every
+    checker knows.
     """
 
     def __init__(self, checker: CheckerLike) -> None:
@@ -53,16 +52,18 @@ class MotionCheck:
         self.count += 1
         if np.any(np.abs(qb - qa)[self._turns] >= np.pi):
             return False
-        if outside_limits(self._robot, np.stack([qa, qb])).any():
+        if outside_limits(self._robot, np.stack([qa, qb]), _ROUNDING).any():
             return False
         return bool(self._check(qa, qb))
 
 
-def outside_limits(robot: Any, path: Waypoints) -> Bool[np.ndarray, " t"]:
-    """Return which rows have a limited joint outside its limits by more than rounding."""
-    low = path < np.asarray(robot.lower) - _ROUNDING
-    high = path > np.asarray(robot.upper) + _ROUNDING
-    return np.asarray(np.any((low | high) & ~np.asarray(robot.continuous, dtype=bool), axis=1))
+def outside_limits(
+    robot: Any, q: Float[np.ndarray, "... dof"], slack: float = 0.0
+) -> Bool[np.ndarray, "... dof"]:
+    """Return which values are beyond the limits of their joints by more than `slack`."""
+    low = q < np.asarray(robot.lower) - slack
+    high = q > np.asarray(robot.upper) + slack
+    return np.asarray((low | high) & ~np.asarray(robot.continuous, dtype=bool))
 
 
 def shorten(
@@ -142,20 +143,14 @@ def _cut(
     if not _no_dearer(cost, path, shorter) or not check(start, end):
         return None
     # Splitting an accepted edge makes new edges: they have to pass by themselves.
-    if a is not None and not check(path[i], a):
-        return None
-    if b is not None and not check(b, path[j + 1]):
-        return None
-    return shorter
+    passed = (a is None or check(path[i], a)) and (b is None or check(b, path[j + 1]))
+    return shorter if passed else None
 
 
 def _point(
     path: Waypoints, along: Float[np.ndarray, " t"], s: float
 ) -> tuple[int, Configuration | None, float]:
-    """Return the edge that holds arc length s, the point there, and s.
-
-    Near a waypoint: its index, None, and its arc length.
-    """
+    """Edge that holds arc length s, the point there, s; near a waypoint its index, None, its s."""
     nearest = int(np.argmin(np.abs(along - s)))
     if abs(along[nearest] - s) <= _SNAP * along[-1]:
         return nearest, None, float(along[nearest])
@@ -237,7 +232,7 @@ def verified(
 ) -> PlanResult:
     """Check every edge of the final waypoints again, and measure the path."""
     began = now()
-    outside = outside_limits(checker.robot, path)
+    outside = outside_limits(checker.robot, path, _ROUNDING)
     verdicts: list[Any] = []
     for edge, (a, b) in enumerate(pairwise(path)):
         verdicts.append(checker.check_motion_report(a, b))
@@ -250,11 +245,9 @@ def verified(
     if refused:
         _log.warning("edge %d of the final path failed its verification", edge)
         reason = "it leaves the joint limits" if beyond else one_line(verdicts[-1])
+        which = f"edge {edge} of {len(path) - 1} of the final path"
+        message = f"{which} was refused when checked again: {reason}"
         report = replace(report, goal_index=None)
-        message = (
-            f"edge {edge} of {len(path) - 1} of the final path was refused when checked again: "
-            f"{reason}"
-        )
         return PlanResult(None, "verification_failed", report, message, path, verdicts[-1])
     clearances = [checker.clearance(q) for q in interpolated(path, clearance_step)]
     shares: dict[str, float] = {}

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vprism_plan._arguments import is_number
+from vprism_plan._arguments import number
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.attempts import Query, attempt, within_risk
 from vprism_plan.planning.goals import (
@@ -24,7 +24,7 @@ from vprism_plan.planning.path import one_line
 from vprism_plan.planning.planners import planner_kind, planners
 from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, SecondOpinion
 from vprism_plan.planning.result import PlanReport, PlanResult
-from vprism_plan.planning.search import SearchRequest, clock_named
+from vprism_plan.planning.search import CLOCKS, SearchRequest
 
 _log = logging.getLogger(__name__)
 
@@ -53,12 +53,11 @@ def plan(
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
-    Start and goal are checked first. The path found is shortened, optionally resampled,
-    and then every edge of the returned array is checked again with
-    `checker.check_motion_report`. If the checker bounds the probability of collision
-    (`max_risk`), the whole path is then judged at once, by worlds the search has not seen;
-    a path that is too risky as a whole is searched for again under a tighter bound on its
-    edges, as long as the time limit allows. Exceptions raised by the checker propagate.
+    Start and goal are checked first. The path found is shortened, optionally resampled, and
+    then every edge of the returned array is checked again with `checker.check_motion_report`.
+    If the checker bounds the probability of collision (`max_risk`), the whole path is then
+    judged by worlds the search has not seen; one that is too risky is searched for again under
+    a tighter bound on its edges, within the time limit. Exceptions of the checker propagate.
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
@@ -67,33 +66,30 @@ def plan(
             pose (4, 4) of the end effector in the world frame (for a robot of four joints: if
             its last row is 0 0 0 1); or a `ReachRegion`. `report.refused_goals` says which
             were refused and why.
-        planner: one of `planners()`: RRTConnect, RRT, RRTstar, InformedRRTstar, SORRTstar,
-            BITstar, AORRTC, FMT, BFMT, PRM, PRMstar, KPIECE1, BKPIECE1 or LBKPIECE1.
+        planner: one of `planners()`.
         time_limit: time for the search in seconds, more than 0; on `clock`. Preparing an
             objective (worlds drawn, the first time) counts; where it alone takes as long, the
             status is "timeout".
         seed: an integer from 0. The same seed gives the same path as long as the search
             ends by itself before the limit. OMPL's generator is global: this seeds it.
-        stop: when the optimising planners (RRTstar, InformedRRTstar, SORRTstar, BITstar,
-            AORRTC, PRMstar) stop: "limit", at the time limit (their path then depends on the
-            machine's speed); "first", at the first solution; "converged", when the cost
-            has settled. The others stop at their first solution in any case.
+        stop: when the planners that are `optimising` stop: "limit", at the time limit (their
+            path then depends on the machine's speed); "first", at the first solution;
+            "converged", when the cost has settled. The others stop at their first solution.
         convergence: for stop="converged": (tolerance, patience), stop when `patience`
             iterations have lowered the cost by less than the fraction `tolerance`.
         simplify: whether to shorten the path after the search.
         simplify_time: seconds after which no further round of shortening starts.
         step: length of the planner's steps in the metric of the space; OMPL's choice
             (a fifth of the space's extent) if None.
-        interpolate: largest distance between waypoints of the result, Euclidean in
-            joint space; no waypoints are added if None. An edge whose pieces do not all
-            pass the check by themselves stays whole.
+        interpolate: largest distance between waypoints of the result, Euclidean in joint space;
+            none are added if None, or to an edge whose pieces do not all pass by themselves.
         clearance_step: distance between the samples of the reported clearance.
         pose_goal: how a pose, or a region, is turned into configurations.
         second_opinion: a `MeshChecker`, asked about the verified path. Where it disagrees,
             the path is still handed out: the report and the message say so.
-        clock: what limits, and all times of the report, are measured by: "wall", or
-            "process", the processor time of this process, comparable on a busy machine (a
-            search that waits, as for a slow checker, ends after fifty times the limit).
+        clock: what limits and times of the report are measured by: "wall", or "process", the
+            processor time of this process, comparable on a busy machine (a search that waits,
+            as for a slow checker, ends after fifty times the limit).
         objective: "length", or a `RiskObjective`. With a risk, only planners that honour an
             objective are accepted; shortening then never raises the cost, and afterwards
             waypoints are moved, within `simplify_time`, where that lowers it. A straight
@@ -103,10 +99,10 @@ def plan(
             their samples around the best path so far.
         margins: metres beyond the checker's own margin, decreasing, such as (0.02, 0.01,
             0.005, 0.0): with room to spare the path keeps away, in a narrow place it goes
-            through. The widest comes first, each with an equal share of the time that is left;
-            the first path is returned, and its `message` names the margin, or else the last
-            answer. Without 0 at the end, problems that only the checker's own margin allows
-            stay unsolved. The checker needs `with_extra_margin`.
+            through. The widest comes first, each with an equal share of the time that is left.
+            The first path is returned (its `message` names the margin), else the last answer.
+            Without 0 at the end, problems that only the checker's own margin allows stay
+            unsolved. The checker needs `with_extra_margin`.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -115,14 +111,14 @@ def plan(
         PlanningError: for a malformed query, naming the value and the valid ones.
     """
     request = SearchRequest(planner, time_limit, seed, stop, convergence, step, clock)
-    for name, value in (("interpolate", interpolate), ("clearance_step", clearance_step)):
-        if value is not None and not (is_number(value) and value > 0.0):
-            raise PlanningError(f"{name} is {value!r}; it must be more than 0")
-    if not (is_number(simplify_time) and simplify_time >= 0.0):
-        raise PlanningError(f"simplify_time is {simplify_time!r} s; it must be at least 0")
-    _refuse_unfit(second_opinion, checker)
+    for name, length in (("interpolate", interpolate), ("clearance_step", clearance_step)):
+        if length is not None or name == "clearance_step":
+            number(name, length, 0.0, above=True, finite=False, error=PlanningError)
+    number("simplify_time", simplify_time, 0.0, unit="s", finite=False, error=PlanningError)
+    if second_opinion is not None:
+        _require_same_robot(second_opinion, checker)
     q_start = configuration(start, checker.robot, "start")
-    now = clock_named(clock)
+    now = CLOCKS[clock]
 
     def answer(judge: CheckerLike, limit: float) -> PlanResult:
         asked = replace(request, time_limit=limit)
@@ -131,7 +127,7 @@ def plan(
             goals, cost, report = found
             query = Query(
                 q_start, goals, asked, cost, warm_start and stop != "first", simplify,
-                float(simplify_time), interpolate, clearance_step, now,
+                float(simplify_time), interpolate, clearance_step,
             )  # fmt: skip
             found = within_risk(
                 judge,
@@ -143,7 +139,7 @@ def plan(
                 paid = found.report.path_length if cost is None else cost.path(found.path)
                 found = replace(found, report=replace(found.report, cost=paid))
         found = replace(found, warnings=tuple(getattr(judge, "warnings", ())))
-        return _reviewed(_with_allowed_contacts(found, judge), judge, second_opinion, now)
+        return _annotated(found, judge, second_opinion, now)
 
     if margins is None:
         return answer(checker, request.time_limit)
@@ -159,20 +155,17 @@ def _widest(
 ) -> PlanResult:
     """Return the answer with the widest margin that has a path, else the last answer."""
     steps = np.asarray(margins, dtype=np.float64)
-    good = steps.ndim == 1 and len(steps) > 0 and np.isfinite(steps).all()
-    if not (good and (steps >= 0.0).all() and (np.diff(steps) < 0.0).all()):
-        raise PlanningError(
-            f"margins is {margins!r}; it must hold decreasing margins of at least 0 m, such as "
-            "(0.02, 0.01, 0.005, 0.0)"
-        )
+    good = steps.ndim == 1 and len(steps) > 0 and steps[-1] >= 0.0 and steps[0] < np.inf
+    if not (good and (np.diff(steps) < 0.0).all()):
+        needed = "decreasing margins of at least 0 m, such as (0.02, 0.01, 0.005, 0.0)"
+        raise PlanningError(f"margins is {margins!r}; it must hold {needed}")
     if not hasattr(checker, "with_extra_margin"):
-        raise PlanningError(
-            f"a {type(checker).__name__} has no with_extra_margin; give a CollisionChecker"
-        )
+        who = type(checker).__name__
+        raise PlanningError(f"a {who} has no with_extra_margin; give a CollisionChecker")
     left = time_limit
-    for number, step in enumerate(steps.tolist()):
+    for k, step in enumerate(steps.tolist()):
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
-        share = left / (len(steps) - number) if left > 0.0 else time_limit / len(steps)
+        share = left / (len(steps) - k) if left > 0.0 else time_limit / len(steps)
         began = now()
         result = answer(judge, share)
         left -= now() - began
@@ -206,24 +199,20 @@ def _prepared(
     if kind.starts_thread and len(goals) > 1:
         raise PlanningError(
             f"{request.planner} deadlocks with more than one goal configuration, here "
-            f"{len(goals)}; give one, or use RRTConnect, or another of `planners()` that starts "
-            "no thread"
+            f"{len(goals)}; give one, or use RRTConnect"
         )
     asked = 1 + len(goals) + len(report.refused_goals)
     report = replace(report, state_checks=asked, motion_checks=len(goals))
     if objective == "length":
         return goals, None, report
     if not isinstance(objective, RiskObjective):
-        raise PlanningError(
-            f"objective is {objective!r}; it must be 'length' or a RiskObjective, for example "
-            "RiskObjective(kind='joint')"
-        )
+        needed = "'length' or a RiskObjective, for example RiskObjective(kind='joint')"
+        raise PlanningError(f"objective is {objective!r}; it must be {needed}")
     if not kind.honours_objective:
         able = ", ".join(name for name, k in planners().items() if k.honours_objective)
-        raise PlanningError(
-            f"{request.planner} does not honour an objective{': it ' if kind.note else ''}"
-            f"{kind.note}; planners that do are {able}"
-        )
+        why = f": it {kind.note}" if kind.note else ""
+        who = f"{request.planner} does not honour an objective{why}"
+        raise PlanningError(f"{who}; planners that do are {able}")
     began, cost = now(), None
     for step in objective.preparation(checker):
         step()
@@ -237,52 +226,42 @@ def _prepared(
         return goals, cost, report
     message = (
         f"preparing the objective '{objective.name}' took {took:.2f} s of the "
-        f"{request.time_limit:g} s allowed; what was prepared is kept: allow more time, plan "
-        "again, or prepare it ahead by objective.cost(checker)"
+        f"{request.time_limit:g} s allowed; it is kept: plan again, or allow more time"
     )
     return PlanResult(None, "timeout", report, message)
 
 
-def _refuse_unfit(judge: Any, checker: CheckerLike) -> None:
+def _require_same_robot(judge: Any, checker: CheckerLike) -> None:
     """Raise PlanningError before any search if the judge cannot be asked about its paths."""
-    if judge is None:
-        return
     if not isinstance(judge, SecondOpinion):
-        raise PlanningError(
-            f"second_opinion is a {type(judge).__name__} without 'robot' and 'review'; give a "
-            "MeshChecker, or None"
-        )
+        who = f"a {type(judge).__name__} without 'robot' and 'review'"
+        raise PlanningError(f"second_opinion is {who}; give a MeshChecker, or None")
     ours, theirs = tuple(checker.robot.joint_names), tuple(judge.robot.joint_names)
     if ours != theirs:
-        raise PlanningError(
-            f"second_opinion is about a robot with joints {theirs}; the checker's are {ours}"
-        )
+        whose = f"{theirs}; the checker's are {ours}"
+        raise PlanningError(f"second_opinion is about a robot with joints {whose}")
 
 
-def _with_allowed_contacts(result: PlanResult, checker: CheckerLike) -> PlanResult:
-    """Say in the report, and the message, what the robot ends touching because it may."""
-    if result.path is None:
-        return result
-    touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
-    if not touching:
-        return result
-    named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
-    message = f"{result.message}; ends touching, as allowed: {named}"
-    report = replace(result.report, allowed_contacts=touching)
-    return replace(result, report=report, message=message)
-
-
-def _reviewed(
+def _annotated(
     result: PlanResult, checker: CheckerLike, judge: SecondOpinion | None, now: Now
 ) -> PlanResult:
-    """Say in the report what another judge makes of the path; it is not obeyed."""
-    if judge is None or result.path is None:
+    """Say what a path ends touching because it may, and what another judge makes of it.
+
+    That judge is not obeyed.
+    """
+    if result.path is None:
         return result
-    began = now()
-    opinion = judge.review(checker, result.path)
-    report = replace(result.report, second_opinion=opinion, second_opinion_time=now() - began)
-    if opinion.valid:
-        return replace(result, report=report)
-    says = one_line(opinion)
-    _log.warning("second opinion on the verified path: %s", says)
-    return replace(result, report=report, message=f"{result.message}; but {says}")
+    report, message = result.report, result.message
+    touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
+    if touching:
+        named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
+        report = replace(report, allowed_contacts=touching)
+        message = f"{message}; ends touching, as allowed: {named}"
+    if judge is not None:
+        began = now()
+        opinion = judge.review(checker, result.path)
+        report = replace(report, second_opinion=opinion, second_opinion_time=now() - began)
+        if not opinion.valid:
+            _log.warning("second opinion on the verified path: %s", one_line(opinion))
+            message = f"{message}; but {one_line(opinion)}"
+    return replace(result, report=report, message=message)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from ompl import base as ob
 from ompl import geometric as og
 
+from vprism_plan._arguments import choice
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.ompl_adapter import StateReader, nearest_turns, write_state
 from vprism_plan.planning.protocols import Configuration, Waypoints
@@ -84,16 +85,11 @@ def planners() -> dict[str, PlannerKind]:
 
 def planner_kind(name: str) -> PlannerKind:
     """Look a planner up; raise PlanningError listing the valid names."""
-    if name not in PLANNERS:
-        raise PlanningError(f"unknown planner {name!r}; valid planners are {', '.join(PLANNERS)}")
-    return PLANNERS[name]
+    return PLANNERS[choice("planner", name, PLANNERS, error=PlanningError)]
 
 
 def make_planner(kind: PlannerKind, si: Any, step: float | None) -> Any:
-    """Return a fresh planner.
-
-    Never reuse one: a second solve of AORRTC after clear() crashes the process.
-    """
+    """Return a fresh planner; a second solve of AORRTC after clear() crashes the process."""
     planner = kind.make(si)
     if step is not None:
         if not kind.has_range:
@@ -111,9 +107,8 @@ def make_planner(kind: PlannerKind, si: Any, step: float | None) -> Any:
 class SpaceLengthObjective(ob.OptimizationObjective):
     """Path length measured by the distance of the state space.
 
-    OMPL's own path length objective brings an informed sampler that exists for
-    RealVector, SE2 and SE3 only; on compound spaces BITstar, AORRTC and
-    InformedRRTstar raise with it. With this one they sample by rejection.
+    OMPL's own brings an informed sampler for RealVector, SE2 and SE3 only; on compound spaces
+    BITstar, AORRTC and InformedRRTstar raise with it. With this one they sample by rejection.
     """
 
     def __init__(self, si: Any) -> None:
@@ -133,7 +128,7 @@ class SpaceLengthObjective(ob.OptimizationObjective):
 
 GOAL_BIAS = 0.5  # share of the samples that a planner which is led asks its goal for
 _FINEST, _WIDEST = 0.01, 0.5  # spread of samples around a path, as a share of the step
-_LEAD_PART = 0.1  # of the planner's step, between states of the lead: see `lead`
+_LEAD_PART = 0.1  # of the planner's step, between states of the lead
 
 
 class GuidedGoal(ob.GoalSampleableRegion):
@@ -145,12 +140,23 @@ class GuidedGoal(ob.GoalSampleableRegion):
     makes that path the planner's first solution, and afterwards states around the best path.
 
     The tree reaches a goal by growing exactly to it; the last state of the lead is one.
-    `sampleGoal` hands the lead out once, then only states around the best path: of goals the
-    tree would collect copies, around `path` (t, dof). `step` is how far the planner grows at
-    once, in the metric of the space.
+    `sampleGoal` hands the lead out once, start left out, then only states around the best path:
+    of goals the tree would collect copies. The tree grows to each state of the lead from its
+    nearest node, which near a thin obstacle may be one on the other side: states much closer
+    together than a step leave the last one nearest.
+
+    `step` is how far the planner grows at once, in the metric of the space; `path` (t, dof) the
+    lead, and to be replaced by better ones.
     """
 
-    def __init__(self, si: Any, goals: Float[np.ndarray, "g dof"], seed: int, step: float) -> None:
+    def __init__(
+        self,
+        si: Any,
+        goals: Float[np.ndarray, "g dof"],
+        seed: int,
+        step: float,
+        path: Waypoints,
+    ) -> None:
         super().__init__(si)
         self.setThreshold(1e-9)
         self._space = si.getStateSpace()
@@ -158,15 +164,7 @@ class GuidedGoal(ob.GoalSampleableRegion):
         self._goals = goals
         self._rng = np.random.default_rng([seed, 0x601D])
         self._step = step
-        self._queue: list[np.ndarray] = []
-        self.path: np.ndarray | None = None
-
-    def lead(self, path: Waypoints) -> None:
-        """Hand out the states of a path, start left out, then states around it.
-
-        The tree grows to each from its nearest node, which near a thin obstacle may be one on
-        the other side: states much closer together than a step leave the last one nearest.
-        """
+        self.path = path
         pieces = [path[:1]]
         compound = self._reader.wraps.any()
         for a, b in pairwise(path):
@@ -175,7 +173,6 @@ class GuidedGoal(ob.GoalSampleableRegion):
             n = max(1, int(np.ceil(width / (_LEAD_PART * self._step))))
             pieces.append(a + (b - a) * (np.arange(1, n + 1)[:, None] / n))
         self._queue = list(np.concatenate(pieces)[:0:-1])
-        self.path = path
 
     def distanceGoal(self, state: Any) -> float:  # noqa: N802 - OMPL's name
         """Return the distance to the nearest goal, largest over the joints."""
@@ -189,13 +186,13 @@ class GuidedGoal(ob.GoalSampleableRegion):
 
     def sampleGoal(self, state: Any) -> None:  # noqa: N802 - OMPL's name
         """Write the next state to grow towards."""
-        assert self.path is not None, "lead() comes first"
-        q = self._queue.pop() if self._queue else self._around(self.path)
+        q = self._queue.pop() if self._queue else self._around()
         write_state(self._space, q, state)
         self._space.enforceBounds(state)  # OMPL takes a goal's samples as they are
 
-    def _around(self, path: Waypoints) -> Configuration:
-        """Return a state near a random place of a path."""
+    def _around(self) -> Configuration:
+        """A state near a random place of the path."""
+        path = self.path
         lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
         place = self._rng.uniform(0.0, float(lengths.sum()))
         edge = min(int(np.searchsorted(np.cumsum(lengths), place)), len(lengths) - 1)

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What planning needs from a robot, from a checker and from a second judge.
 
-`vprism_plan.collision.CollisionChecker` satisfies `CheckerLike`; so does any other
-object with these members, which is how the adapter is tested and how a user brings
-a checker of their own.
+`vprism_plan.collision.CollisionChecker` satisfies `CheckerLike`; so does any other object with
+these members, such as a user's own checker.
 """
 
 from collections.abc import Callable
@@ -47,9 +46,8 @@ class RobotLike(Protocol):
 class CheckerLike(Protocol):
     """Verdicts about configurations and straight motions of one robot in one world.
 
-    The two `*_buffer` forms take float64 C-contiguous arrays of length dof and skip
-    all validation except that NaN is never valid; they must be safe to call from
-    several threads. With `max_risk`, a bound on the probability of collision that is not
+    The two `*_buffer` forms take float64 C-contiguous arrays of length dof, unchecked (but NaN
+    is never valid), and must be safe to call from several threads. With a `max_risk` that is not
     None, `collision_probability(path, held_out=True)` and `tightened(level)` are asked, too;
     see `attempts.within_risk`.
     """

@@ -19,8 +19,8 @@ class Improvement:
     Attributes:
         time: seconds since the search began, on the query's clock.
         cost: by the objective; the planner's own value.
-        path: (T, dof) radians and metres, as the planner found it: each motion passed the
-            check of the search, none was shortened or verified again.
+        path: (T, dof) radians and metres, as the search found and checked it: neither
+            shortened nor verified again.
     """
 
     time: float
@@ -30,12 +30,7 @@ class Improvement:
 
 @dataclass(frozen=True)
 class RefusedGoal:
-    """A configuration that reaches the goal but that nobody may be in.
-
-    Attributes:
-        q: (dof,) radians and metres.
-        reason: what the checker says.
-    """
+    """A configuration q (dof,) that reaches the goal but is invalid; why, by the checker."""
 
     q: tuple[float, ...]
     reason: str
@@ -59,20 +54,19 @@ class PlanReport:
         min_clearance: smallest `checker.clearance` at `clearance_samples` along the path,
             metres, NaN without a path; the path's safety rests on its verification, not on it.
         clearance_samples: their number.
-        searches: how often the planner ran; again, with another seed derived from the given
-            one, where a path it accepted failed verification.
+        searches: how often the planner ran; again, with another seed, where a path failed
+            verification.
         direct: whether the straight motion to the goal was valid, so that no search ran.
         goal_index: which of several goal configurations (given, or solutions of a pose or a
             region; without those refused) was reached, None if none was.
-        refused_goals: which were refused, and why. Solutions of a pose or a region are tried,
-            nearest to the start first, until there are enough.
+        refused_goals: which were refused, and why; of a pose or region until enough were valid.
         certified: whether computed clearances cover every edge, with nothing left to sampling.
         tolerance: largest motion, metres, between a point of the path and a
             configuration known to be free (0 when certified), NaN without a path.
         shares: largest share of the robot's volume, at the waypoints, in each kind of unseen
             space ("occluded", "unobserved", ...) that the checker reports.
-        second_opinion: what another judge says of the verified path (`valid`, `text()`; of
-            `MeshChecker` a `PathOpinion`); None if nobody was asked or there is no path.
+        second_opinion: what another judge says of the verified path (`valid`, `text()`); None
+            if nobody was asked or there is no path.
         second_opinion_time: seconds that took.
         risk: joint probability that the path collides, by worlds the search has not seen
             (a `RiskEstimate`); None if the checker has no `max_risk`, or without a path.

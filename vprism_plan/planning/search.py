@@ -2,8 +2,7 @@
 """One search with OMPL: numpy in, numpy out.
 
 Every OMPL object lives and dies inside `search`; nothing of it outlives the call, so
-nothing can leak and no planner is ever used twice. What is global to the process, the log
-and the seed of the generators, is set here as well.
+nothing can leak and no planner is ever used twice.
 """
 
 import math
@@ -19,9 +18,13 @@ from jaxtyping import Float
 from ompl import base as ob
 from ompl import util as ou
 
-from vprism_plan._arguments import is_number, is_whole
+from vprism_plan._arguments import choice, number, whole
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning.objectives import PathCost, make_objective
+from vprism_plan.planning.objectives import (
+    PathCost,
+    VPrismMinimaxRiskObjective,
+    VPrismRiskObjective,
+)
 from vprism_plan.planning.ompl_adapter import (
     StateReader,
     VPrismMotionValidator,
@@ -46,7 +49,7 @@ MAX_SEED = 2**32 - 2
 # while it waits for goals, which spends none. A machine that busy would be no help anyway.
 PATIENCE = 50.0
 # Processor time is that of the whole process, worker threads included.
-_CLOCKS: dict[str, Now] = {"wall": time.perf_counter, "process": time.process_time}
+CLOCKS: dict[str, Now] = {"wall": time.perf_counter, "process": time.process_time}
 _GOAL_TOLERANCE = 1e-9
 _NOTICEABLE = 0.02  # relative fall of the cost that is worth a look at the path
 
@@ -65,36 +68,30 @@ class SearchRequest:
 
     def __post_init__(self) -> None:
         kind = planner_kind(self.planner)
-        clock_named(self.clock)
+        choice("clock", self.clock, CLOCKS, error=PlanningError)
         if kind.starts_thread and self.clock != "wall":
-            raise PlanningError(
-                f"clock is {self.clock!r} with {self.planner}: its second thread would wait for "
-                "ever for a termination condition that is Python; use clock='wall'"
-            )
+            why = f"{self.planner}'s second thread would wait for ever"
+            raise PlanningError(f"clock is {self.clock!r}: {why}; use clock='wall'")
         if self.stop == "converged" and kind.optimising and not kind.reports_cost:
-            raise PlanningError(
-                f"{self.planner} does not say what its path costs; use stop='limit'"
-            )
-        limit, step = self.time_limit, self.step
-        if not (is_number(limit) and math.isfinite(limit) and limit > 0):
-            raise PlanningError(f"time_limit is {limit!r} s; it must be finite and more than 0")
-        if self.stop not in ("limit", "first", "converged"):
-            raise PlanningError(
-                f"stop is {self.stop!r}; valid values are 'limit', 'first', 'converged'"
-            )
+            who = self.planner
+            raise PlanningError(f"{who} does not say what its path costs; use stop='limit'")
+        set_ = object.__setattr__
+        limit = number("time_limit", self.time_limit, 0.0, above=True, error=PlanningError)
+        set_(self, "time_limit", limit)
+        choice("stop", self.stop, ("limit", "first", "converged"), error=PlanningError)
         tolerance, patience = self.convergence
         if not (0.0 < tolerance < 1.0 and patience >= 1):
-            raise PlanningError(
-                f"convergence is {self.convergence!r}; it must be (tolerance in (0, 1), patience "
-                "of at least 1 iteration)"
-            )
-        if step is not None and not (is_number(step) and math.isfinite(step) and step > 0.0):
-            raise PlanningError(f"step is {step!r}; it must be finite and more than 0, or None")
-        set_ = object.__setattr__
-        set_(self, "time_limit", float(limit))
-        set_(self, "seed", checked_seed(self.seed))
+            needed = "(tolerance in (0, 1), patience of at least 1 iteration)"
+            raise PlanningError(f"convergence is {self.convergence!r}; it must be {needed}")
         set_(self, "convergence", (float(tolerance), int(patience)))
-        set_(self, "step", None if step is None else float(step))
+        if self.step is not None:
+            set_(self, "step", number("step", self.step, 0.0, above=True, error=PlanningError))
+        set_(self, "seed", checked_seed(self.seed))
+
+    @property
+    def now(self) -> Now:
+        """Reads the clock, seconds."""
+        return CLOCKS[self.clock]
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,7 @@ def search(
         space = state_space(checker.robot)
         si = ob.SpaceInformation(space)
         held = _HeldErrors(checker) if kind.starts_thread else None
-        judge: CheckerLike = checker if held is None else held
+        judge: Any = held or checker
         states = VPrismStateValidityChecker(si, judge)
         motions = VPrismMotionValidator(si, judge)
         si.setStateValidityChecker(states)
@@ -149,33 +146,35 @@ def search(
         if lead is not None:
             planner.setProblemDefinition(problem)
             planner.setup()  # settles the planner's steps
-            guided = GuidedGoal(si, goals, request.seed, planner.getRange())
-            guided.lead(lead)
+            guided = GuidedGoal(si, goals, request.seed, planner.getRange(), lead)
             problem.setGoal(guided)
             planner.setGoalBias(GOAL_BIAS)
         planner.setProblemDefinition(problem)
         planner.setup()
 
         reader = StateReader(space, len(start))
-        now = clock_named(request.clock)
-        began = now()
+        began = request.now()
         if held is None:
             status, history = _solve(planner, problem, reader, start, request, guided)
         else:
             status, history = held.solve(planner, time_is_up(request.clock, request.time_limit)), ()
-        planned = now()
+        took = request.now() - began
 
         verdict: Literal["exact", "approximate", "timeout"] = "timeout"
         path, goal_index = None, None
         if problem.hasSolution():
             solution = problem.getSolutionPath()
-            goal_index = _reached(reader, solution, goals)
+            last = reader.read(solution.getState(solution.getStateCount() - 1))
+            away = np.abs(nearest_turns(goals, last, reader.wraps) - last).max(axis=1)
+            nearest = int(np.argmin(away))
+            goal_index = nearest if away[nearest] <= _GOAL_TOLERANCE else None
             claimed = status == ob.PlannerStatus.EXACT_SOLUTION and problem.hasExactSolution()
             # OMPL calls approximate solutions "solved"; the last state decides.
             verdict = "exact" if claimed and goal_index is not None else "approximate"
             path = _waypoints(reader, solution, start)
-        took, asked = planned - began, (states.checks, motions.checks)
-        return SearchOutcome(verdict, path, goal_index, took, *asked, history)
+        return SearchOutcome(
+            verdict, path, goal_index, took, states.checks, motions.checks, history
+        )
 
 
 def _set_objective(
@@ -183,13 +182,13 @@ def _set_objective(
 ) -> None:
     kind = planner_kind(request.planner)
     if cost is not None and kind.honours_objective:
-        objective = make_objective(si, checker, cost)
+        risk = VPrismMinimaxRiskObjective if cost.worst else VPrismRiskObjective
+        objective = risk(si, checker, cost=cost)
     elif kind.starts_thread:
         objective = ob.PathLengthOptimizationObjective(si)  # the only one that is no Python
     elif kind.optimising or kind.honours_objective:
         compound = si.getStateSpace().isCompound()
-        length = SpaceLengthObjective if compound else ob.PathLengthOptimizationObjective
-        objective = length(si)
+        objective = (SpaceLengthObjective if compound else ob.PathLengthOptimizationObjective)(si)
     else:
         return
     if request.stop == "first" and kind.obeys_threshold:
@@ -208,7 +207,7 @@ def _solve(
 ) -> tuple[Any, tuple[Improvement, ...]]:
     """Run the planner until it is done or has to stop; note every better path on the way."""
     kind = planner_kind(request.planner)
-    now = clock_named(request.clock)
+    now = request.now
     began = now()
     end = began + request.time_limit
     if not (kind.optimising and kind.reports_cost):
@@ -243,12 +242,9 @@ def _solve(
 class _Progress:
     """A termination condition: the best cost has become noticeably better, or has settled.
 
-    Between two calls of `solve` the best path can be read; while it runs, it cannot. Calls
-    (one per iteration) and costs decide, not clocks: the same seed stops at the same ones.
-
-    Attributes:
-        settled: whether `patience` calls brought less than the relative `tolerance`, where
-            the request asks for that; a patience of 0 settles at the first solution.
+    The best path can be read only between two calls of `solve`. Calls (one per iteration) and
+    costs decide, not clocks: the same seed stops at the same ones. `settled`: `patience` calls
+    brought less than the relative `tolerance`, if that is asked for (0: at the first solution).
     """
 
     def __init__(self, planner: Any, request: SearchRequest, kind: PlannerKind) -> None:
@@ -279,16 +275,8 @@ class _Progress:
         return self.settled
 
 
-def _reached(reader: StateReader, solution: Any, goals: Float[np.ndarray, "g dof"]) -> int | None:
-    last = reader.read(solution.getState(solution.getStateCount() - 1))
-    worst = np.max(np.abs(nearest_turns(goals, last, reader.wraps) - last), axis=1)
-    best = int(np.argmin(worst))
-    return best if worst[best] <= _GOAL_TOLERANCE else None
-
-
 def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoints:
-    """Copy a path to numpy, wrapping coordinates continued from row to row, from the start's
-    own turns on."""
+    """Copy a path to numpy, wrapping coordinates continued from the start's own turns on."""
     rows = [start]
     for state in path.getStates()[1:]:
         rows.append(nearest_turns(reader.read(state).copy(), rows[-1], reader.wraps))
@@ -298,15 +286,13 @@ def _waypoints(reader: StateReader, path: Any, start: Configuration) -> Waypoint
 class _HeldErrors:
     """A checker whose first exception waits until the search is over.
 
-    PRM and PRMstar run a second C++ thread. An exception that leaves `solve` destroys it
-    unjoined, and the process ends with `std::terminate`. So the first one is held back, later
-    questions are answered "invalid", the search is told to stop, and `solve` raises it again.
+    PRM and PRMstar run a second C++ thread, which an exception that leaves `solve` destroys
+    unjoined: the process ends with `std::terminate`. So the first one is held back, later
+    questions are answered "invalid", the search is stopped, and `solve` raises it again.
     """
 
     def __init__(self, checker: CheckerLike) -> None:
-        self.robot, self.clearance, self.explain = checker.robot, checker.clearance, checker.explain
-        self.is_valid, self.check_motion = checker.is_valid, checker.check_motion
-        self.check_motion_report = checker.check_motion_report
+        self.robot, self.clearance = checker.robot, checker.clearance
         self._checker = checker
         self._stop: Callable[[], None] | None = None
         self._error: BaseException | None = None
@@ -329,7 +315,7 @@ class _HeldErrors:
             return False
 
     def solve(self, planner: Any, timed: Any) -> Any:
-        """Run a planner and return its status, or raise what was held back."""
+        """Return the planner's status, or raise what was held back."""
         self._stop = timed.terminate
         status = planner.solve(timed)
         self._stop = None
@@ -342,16 +328,6 @@ class _HeldErrors:
         return status
 
 
-def clock_named(name: str) -> Now:
-    """Return the function that reads a clock, seconds; raise PlanningError for an unknown name."""
-    if name not in _CLOCKS:
-        raise PlanningError(
-            f"clock is {name!r}; valid values are 'wall' (time that passes) and 'process' "
-            "(processor time of this process, which other load does not inflate)"
-        )
-    return _CLOCKS[name]
-
-
 def time_is_up(name: str, seconds: float) -> Any:
     """Return an OMPL termination condition that holds `seconds` from now on a clock.
 
@@ -360,7 +336,7 @@ def time_is_up(name: str, seconds: float) -> Any:
     if name == "wall":
         # The form without an interval reads the clock itself: no extra thread, no overshoot.
         return ob.timedPlannerTerminationCondition(seconds)
-    now = clock_named(name)
+    now = CLOCKS[name]
     end = now() + seconds
     asleep = time.perf_counter() + PATIENCE * seconds
     return ob.PlannerTerminationCondition(lambda: now() >= end or time.perf_counter() >= asleep)
@@ -375,8 +351,7 @@ _saved_level: Any = None
 def quiet_ompl() -> Iterator[None]:
     """Silence OMPL's console log inside the block and restore its level afterwards.
 
-    The level is global to the process. Blocks may nest or overlap between threads:
-    the first one in saves the level, the last one out restores it.
+    The level is global to the process; blocks may nest or overlap between threads.
     """
     global _quiet_depth, _saved_level  # noqa: PLW0603 - OMPL's level is global itself
     with _lock:
@@ -394,7 +369,5 @@ def quiet_ompl() -> Iterator[None]:
 
 
 def checked_seed(seed: Any) -> int:
-    """Return the seed as an int; raise PlanningError unless it is an integer from 0."""
-    if not is_whole(seed) or not 0 <= seed <= MAX_SEED:
-        raise PlanningError(f"seed is {seed!r}; it must be an integer from 0 to {MAX_SEED}")
-    return int(seed)
+    """Return the seed as an int; raise PlanningError unless it is one from 0 to `MAX_SEED`."""
+    return whole("seed", seed, 0, MAX_SEED, error=PlanningError)

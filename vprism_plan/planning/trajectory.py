@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """From a verified path to a timed trajectory that never leaves it.
 
-The checker certified straight lines in joint space. Blending corners would leave them,
-so the motion stops where the direction changes, and nowhere else. Between stops all
-joints share one trapezoidal profile along the line.
-
-Files hold `trajectory_msgs/JointTrajectory` in JSON.
+The checker certified straight lines in joint space. Blending corners would leave them, so the
+motion stops where the direction changes, and nowhere else. Between stops all joints share one
+trapezoidal profile along the line. Files hold `trajectory_msgs/JointTrajectory` in JSON.
 """
 
 import json
@@ -20,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from vprism_plan._arguments import is_whole
+from vprism_plan._arguments import is_whole, number
 from vprism_plan._files import read_json, reading, write_text
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.protocols import Configuration
@@ -36,9 +34,8 @@ _NANOSECONDS = 10**9
 class Trajectory:
     """A motion over time, as cubic pieces.
 
-    Every change of acceleration is a point, so cubic interpolation of positions and
-    velocities, which is what trajectory controllers do when they are given no
-    accelerations, reproduces the trapezoidal profile exactly and stays on the path.
+    Every change of acceleration is a point, so cubic interpolation of positions and velocities,
+    as controllers do without accelerations, is the trapezoidal profile and stays on the path.
 
     Attributes:
         times: (n,) seconds from the start, increasing, the first is 0.
@@ -100,8 +97,7 @@ def time_parameterize(
         raise PlanningError(f"path has shape {path.shape}; {needed}")
     if not np.isfinite(path).all():
         raise PlanningError("the path holds NaN or infinite values")
-    if not 0.0 < scale <= 1.0:
-        raise PlanningError(f"scale is {scale!r}; it must be more than 0 and at most 1")
+    number("scale", scale, 0.0, 1.0, above=True, error=PlanningError)
     given = robot.velocity_limits if velocity_limits is None else velocity_limits
     speed = _limits("velocity", given, names)
     push = speed / _SECONDS_TO_FULL_SPEED
@@ -119,15 +115,12 @@ def time_parameterize(
 def _limits(kind: str, values: ArrayLike, names: tuple[str, ...]) -> Configuration:
     limits = np.asarray(values, dtype=np.float64)
     if limits.shape != (len(names),):
-        raise PlanningError(
-            f"{kind} limits have shape {limits.shape}; one per joint is needed: {', '.join(names)}"
-        )
+        needed = f"one per joint is needed: {', '.join(names)}"
+        raise PlanningError(f"{kind} limits have shape {limits.shape}; {needed}")
     for name, limit in zip(names, limits, strict=True):
-        if not (math.isfinite(limit) and limit > 0.0):
-            raise PlanningError(
-                f"{kind} limit of joint {name!r} is {limit}; it must be finite and more than 0 "
-                f"(pass {kind}_limits if the robot's description has none)"
-            )
+        hint = f"(pass {kind}_limits if the robot's description has none)"
+        what = f"{kind} limit of joint {name!r}"
+        number(what, float(limit), 0.0, unit=hint, above=True, error=PlanningError)
     return limits
 
 
@@ -163,7 +156,7 @@ def _timed(
     total = cruise + 2.0 * ramp
 
     def profile(t: float) -> tuple[float, float]:
-        """Return s and s' of the trapezoid at time t."""
+        """s and s' of the trapezoid at time t."""
         if t <= ramp:
             return 0.5 * rate * t * t, rate * t
         if t < total - ramp:
@@ -172,7 +165,7 @@ def _timed(
         return 1.0 - 0.5 * rate * left * left, rate * left
 
     def time_at(s: float) -> float:
-        """Return the time at which the trapezoid reaches s."""
+        """Time at which the trapezoid reaches s."""
         if s <= 0.5 * top * ramp:
             return math.sqrt(2.0 * s / rate)
         if s <= 1.0 - 0.5 * top * ramp:
@@ -208,10 +201,8 @@ def write_trajectory(
     """
     names = [str(name) for name in robot.joint_names]
     if trajectory.positions.shape[1:] != (len(names),):
-        raise PlanningError(
-            f"the trajectory has {trajectory.positions.shape[1:]} joints, the robot {len(names)}: "
-            f"{', '.join(names)}"
-        )
+        given = f"{trajectory.positions.shape[1:]} joints"
+        raise PlanningError(f"the trajectory has {given}, the robot {', '.join(names)}")
     ticks = [round(float(t) * _NANOSECONDS) for t in trajectory.times]
     if any(b <= a for a, b in pairwise(ticks)):
         raise PlanningError("points of the trajectory are less than a nanosecond apart")

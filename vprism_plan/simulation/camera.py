@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A pinhole camera and the sensor noise of a structured-light depth camera."""
+"""A pinhole camera, what it sees, and the sensor noise of a structured-light depth camera."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int, UInt8
+
+MAX_RANGE = 3.0  # metres of depth beyond which the simulated sensor reports nothing
+_PALETTE = np.frombuffer(  # label 0: table and clutter
+    bytes.fromhex("b2b0aad6604d4393c35aae61e3aa3c9970ab50bebec878a0968c466e6ec8e68c64"), np.uint8
+).reshape(-1, 3)
 
 
 def _default_intrinsics() -> np.ndarray:
@@ -44,14 +49,9 @@ class Camera:
         **kwargs: object,
     ) -> "Camera":
         """Return a camera at `distance` metres from `target`, angles in radians."""
-        offset = distance * np.array(
-            [
-                np.cos(elevation) * np.cos(azimuth),
-                np.cos(elevation) * np.sin(azimuth),
-                np.sin(elevation),
-            ]
-        )
-        return cls.look_at(np.asarray(target) + offset, np.asarray(target), **kwargs)
+        level = np.cos(elevation)
+        offset = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
+        return cls.look_at(np.asarray(target) + distance * offset, np.asarray(target), **kwargs)
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
@@ -137,10 +137,53 @@ class DepthNoise:
         draw = rng.random(depth.shape)
         flying = edge & (draw < self.flying_probability)
         mix = rng.random(depth.shape)
-        noisy[flying] = (mix * depth + (1 - mix) * np.where(depth - near > far - depth, near, far))[
-            flying
-        ]
+        other_side = np.where(depth - near > far - depth, near, far)
+        noisy[flying] = (mix * depth + (1 - mix) * other_side)[flying]
         lost = edge & (draw > 1 - self.edge_hole_probability)
         lost |= cosine < self.grazing_cosine * rng.random(depth.shape)
         noisy = np.round(noisy / self.quantum) * self.quantum
         return np.where(valid & ~lost & (noisy > 0), noisy, 0.0)
+
+
+def table_depth(camera: Camera, directions: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    """Return the optical depth of the table z = 0 along each ray, metres; inf for a miss."""
+    with np.errstate(divide="ignore"):
+        table = -camera.center[2] / directions[..., 2]
+    return np.where(table > 0, table, np.inf)
+
+
+def sense(
+    camera: Camera,
+    directions: Float[np.ndarray, "h w 3"],
+    depth: Float[np.ndarray, "h w"],
+    normals: Float[np.ndarray, "h w 3"],
+    labels: Int[np.ndarray, "h w"],
+    hit: Int[np.ndarray, "h w"],
+    noise: DepthNoise | None,
+    seed: int,
+) -> tuple[Float[np.ndarray, "h w"], UInt8[np.ndarray, "h w 3"]]:
+    """Return the depth that the sensor reports (0 = no return), and a shaded picture.
+
+    Args:
+        camera: the view.
+        directions: rays with optical depth 1 per unit of parameter.
+        depth: exact optical depth, metres, inf for a miss.
+        normals: unit normals of what each ray hits.
+        labels: object id, 0 for the table and for clutter.
+        hit: index of the body, -1 for the table.
+        noise: sensor model, or None for exact depth.
+        seed: of the noise.
+    """
+    unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    cosine = np.abs((unit * normals).sum(-1))
+    depth = np.where(depth > MAX_RANGE, 0.0, depth)
+    # Lambert shading with one light from above, one palette colour per object.
+    light = np.array([0.35, -0.25, 0.9])
+    intensity = 0.45 + 0.55 * np.clip(normals @ (light / np.linalg.norm(light)), 0.0, 1.0)
+    base = _PALETTE[np.where(labels > 0, (labels - 1) % (len(_PALETTE) - 1) + 1, 0)].astype(float)
+    base[(hit >= 0) & (labels == 0)] = (120, 110, 100)
+    base[depth == 0] = 60
+    color = np.clip(base * intensity[..., None], 0, 255).astype(np.uint8)
+    if noise is not None:
+        depth = noise.apply(depth, cosine, 1.0 / camera.intrinsics[0, 0], seed)
+    return depth, color

@@ -21,44 +21,41 @@ _FORMAT = "vprism_plan scene, version 1"
 GROUND_TRUTH = "ground_truth.json"
 
 
-def scene_to_dict(scene: Scene) -> dict[str, Any]:
-    """Return everything that defines a scene, JSON-ready and exact."""
+def _to_dict(scene: Scene) -> dict[str, Any]:
     return {
         "format": _FORMAT,
         "name": scene.name,
         "seed": scene.seed,
         "labels": list(scene.labels),
         "solids": [solid.to_dict() for solid in scene.solids],
-        "camera": {
-            "T_world_camera": scene.camera.T_world_camera.tolist(),
-            "intrinsics": scene.camera.intrinsics.tolist(),
-            "width": scene.camera.width,
-            "height": scene.camera.height,
-        },
-        "noise": None if scene.noise is None else asdict(scene.noise),
+        **view_to_dict(scene.camera, scene.noise),
     }
 
 
-def scene_from_dict(data: dict[str, Any]) -> Scene:
-    """Rebuild a scene; raises ObservationError for another format."""
+def view_to_dict(camera: Camera, noise: DepthNoise | None) -> dict[str, Any]:
+    """Return `camera` and `noise`, JSON-ready and exact."""
+    pose, intrinsics = camera.T_world_camera.tolist(), camera.intrinsics.tolist()
+    return {
+        "camera": {**vars(camera), "T_world_camera": pose, "intrinsics": intrinsics},
+        "noise": None if noise is None else asdict(noise),
+    }
+
+
+def view_from_dict(data: dict[str, Any]) -> tuple[Camera, DepthNoise | None]:
+    """Rebuild what `view_to_dict` described."""
+    camera = dict(data["camera"])
+    for name in ("T_world_camera", "intrinsics"):
+        camera[name] = np.asarray(camera[name], dtype=np.float64)
+    return Camera(**camera), None if data["noise"] is None else DepthNoise(**data["noise"])
+
+
+def _from_dict(data: dict[str, Any]) -> Scene:
     if data.get("format") != _FORMAT:
         raise ObservationError(
             f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
         )
-    camera = data["camera"]
-    return Scene(
-        tuple(solid_from_dict(solid) for solid in data["solids"]),
-        tuple(data["labels"]),
-        Camera(
-            np.asarray(camera["T_world_camera"], dtype=np.float64),
-            np.asarray(camera["intrinsics"], dtype=np.float64),
-            camera["width"],
-            camera["height"],
-        ),
-        None if data["noise"] is None else DepthNoise(**data["noise"]),
-        data["seed"],
-        data["name"],
-    )
+    solids, labels = tuple(map(solid_from_dict, data["solids"])), tuple(data["labels"])
+    return Scene(solids, labels, *view_from_dict(data), data["seed"], data["name"])
 
 
 def save_scene(scene: Scene, path: str | Path) -> None:
@@ -72,7 +69,7 @@ def save_scene(scene: Scene, path: str | Path) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_observation(scene.observation, path)
-    write_text(_truth_path(path), json.dumps(scene_to_dict(scene), indent=1) + "\n")
+    write_text(_truth_path(path), json.dumps(_to_dict(scene), indent=1) + "\n")
 
 
 def load_ground_truth(path: str | Path) -> Scene:
@@ -81,7 +78,7 @@ def load_ground_truth(path: str | Path) -> Scene:
     if not truth.is_file():
         raise ObservationError(f"{truth} does not exist; a scene is written by save_scene")
     with reading(truth, "the truth of a scene", ObservationError):
-        return scene_from_dict(read_json(truth, ObservationError))
+        return _from_dict(read_json(truth, ObservationError))
 
 
 def _truth_path(path: Path) -> Path:

@@ -5,7 +5,7 @@ World frame: z up, table top at z = 0, metres. A scene keeps the analytic solids
 the signed distance to the truth is exact everywhere, also where no camera sees.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.perception.observation import Observation
-from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.imaging import sense, table_depth
-from vprism_plan.simulation.placement import gather, random_camera, random_solid, upright
+from vprism_plan.simulation.camera import Camera, DepthNoise, sense, table_depth
 from vprism_plan.simulation.solids import Box, Capsule, Frustum, Solid, cylinder, sphere
 
 if TYPE_CHECKING:
     import trimesh
+
+_SPACING = 0.006  # metres between the surface samples that gaps between solids are measured with
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,11 @@ class Scene:
     camera: Camera
     noise: DepthNoise | None = None
     seed: int = 0
-    name: str = field(default="scene")
+    name: str = "scene"
 
     @cached_property
     def observation(self) -> Observation:
-        """What the scene's own camera saw (with its noise)."""
+        """What the scene's own camera saw, with its noise."""
         return render(self, self.camera, noise=self.noise, seed=self.seed)
 
     @property
@@ -50,10 +50,10 @@ class Scene:
     def signed_distance(
         self, points: Float[np.ndarray, "n 3"], *, table: bool = False
     ) -> Float[np.ndarray, "n"]:
-        """Return the exact signed distance to the nearest true solid, metres.
+        """Return the exact signed distance to the nearest true solid, metres, negative inside.
 
-        Negative inside. With `table`, the half-space z <= 0 counts too. Inside
-        touching solids the value is exact per solid (the union's may be deeper).
+        With `table`, the half-space z <= 0 counts too. Inside touching solids the value is
+        exact per solid (the union's may be deeper).
         """
         points = np.asarray(points, dtype=np.float64)
         best = points[:, 2].copy() if table else np.full(len(points), np.inf)
@@ -62,10 +62,7 @@ class Scene:
         return best
 
     def object_of(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
-        """Return the object id of the solid that contains each point.
-
-        0 where there is none; clutter that carries no label gives -1.
-        """
+        """Return the object id at each point: 0 where no solid is, -1 in unlabelled clutter."""
         ids = np.zeros(len(points), dtype=np.int64)
         for solid, label in zip(self.solids, self.labels, strict=True):
             ids[solid.signed_distance(points) <= 0] = label if label > 0 else -1
@@ -96,7 +93,6 @@ def render(
     """
     directions = camera.ray_directions()
     shape = directions.shape[:2]
-    depth = np.full(shape, np.inf)
     depth = table_depth(camera, directions)
     labels = np.zeros(shape, dtype=np.int32)
     hit = np.full(shape, -1)
@@ -123,6 +119,98 @@ def render(
         camera.intrinsics.copy(),
         camera.T_world_camera.copy(),
         color=color,
+    )
+
+
+def upright(xy: np.ndarray, z: float, yaw: float) -> np.ndarray:
+    """Return the pose (4, 4) of a solid with its axis vertical, its origin at (xy, z)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    pose = np.eye(4)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = (xy[0], xy[1], z)
+    return pose
+
+
+def _lying(z: float, yaw: float) -> np.ndarray:
+    """Return a pose whose local z axis is horizontal."""
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    pose = upright(np.zeros(2), z, yaw)
+    pose[:3, :3] = pose[:3, :3] @ tilt
+    return pose
+
+
+def random_solid(rng: np.random.Generator) -> Solid:
+    """Return a household-sized solid that rests on z = 0 above the origin."""
+    kind = rng.choice(["box", "cylinder", "lying", "cup", "sphere", "capsule"])
+    yaw = rng.uniform(-np.pi, np.pi)
+    if kind == "box":
+        x, y, z = (float(v) for v in rng.uniform([0.02, 0.025, 0.02], [0.05, 0.08, 0.11]))
+        return Box((x, y, z), pose=upright(np.zeros(2), z, yaw))
+    radius = float(rng.uniform(0.022, 0.045))
+    if kind == "sphere":
+        return Capsule(radius, 0.0, pose=upright(np.zeros(2), radius, 0.0))
+    half = float(rng.uniform(0.03, 0.1))
+    if kind == "cylinder":
+        return cylinder(radius, half, upright(np.zeros(2), half, yaw))
+    if kind == "lying":
+        return cylinder(radius, half, _lying(radius, yaw))
+    if kind == "capsule":
+        return Capsule(radius, half * 0.7, pose=_lying(radius, yaw))
+    top = radius * float(rng.uniform(0.5, 1.3))
+    return Frustum(radius, top, half, pose=upright(np.zeros(2), half, yaw))
+
+
+def clearance_between(a: Solid, b: Solid) -> float:
+    """Return a lower bound of the distance between two solids, metres.
+
+    Measured from surface samples of each against the exact distance of the other;
+    half the diagonal of the sample spacing covers what lies between samples.
+    """
+    near = min(
+        float(b.signed_distance(a.surface_points(_SPACING)).min()),
+        float(a.signed_distance(b.surface_points(_SPACING)).min()),
+    )
+    return near - _SPACING / np.sqrt(2.0)
+
+
+def gather(solids: list[Solid], gap: tuple[float, float], rng: np.random.Generator) -> list[Solid]:
+    """Slide solids towards the origin, one after another, each up to a random gap.
+
+    Returns them in the given order, no two closer than 5 mm.
+    """
+    placed: list[Solid] = []
+    for solid in solids:
+        direction = rng.uniform(-np.pi, np.pi)
+        heading = np.array([np.cos(direction), np.sin(direction)])
+        wanted = max(0.005, float(rng.uniform(*gap)))
+        distance = 0.0
+        while True:
+            pose = solid.pose.copy()
+            pose[:2, 3] += distance * heading
+            candidate = replace(solid, pose=pose)
+            near = min(
+                (_quick_clearance(candidate, other, wanted) for other in placed), default=1.0
+            )
+            if near >= wanted:
+                break
+            distance += max(0.25 * (wanted - near), 0.003)
+        placed.append(candidate)
+    return placed
+
+
+def _quick_clearance(a: Solid, b: Solid, enough: float) -> float:
+    """Return the clearance, or the bounding balls' when that alone is enough."""
+    balls = float(np.linalg.norm(a.center - b.center)) - a.bounding_radius - b.bounding_radius
+    return balls if balls >= enough else clearance_between(a, b)
+
+
+def random_camera(rng: np.random.Generator) -> Camera:
+    """Return a camera 0.8 to 1.2 m from the middle of the scene, 30 to 50 degrees above it."""
+    return Camera.orbit(
+        np.array([0.0, 0.0, 0.06]),
+        float(rng.uniform(0.8, 1.2)),
+        float(rng.uniform(-np.pi, np.pi)),
+        float(np.deg2rad(rng.uniform(30.0, 50.0))),
     )
 
 
@@ -195,18 +283,18 @@ def hidden_object_scene(seed: int, noise: bool = True) -> Scene:
 
 
 def demo_scene() -> Scene:
-    """Return the scene of the demo: six objects in a row of clutter, seen from one side.
+    """Return the scene of the demo, which `save_scene` wrote to `vprism_plan/data/demo_scene`.
 
-    The clutter forms a wall along y that an arm must cross from -x ... +x around or
-    over, with short objects hidden behind tall ones.
+    Six objects form a wall along y, seen from one side, that an arm must cross around or over,
+    with short objects hidden behind tall ones.
     """
-    solids: list[Solid] = [
+    solids = (
         Box((0.03, 0.08, 0.115), pose=upright(np.array([-0.02, -0.02]), 0.115, 0.15)),
         cylinder(0.034, 0.055, upright(np.array([0.07, 0.10]), 0.055, 0.0)),
         Frustum(0.045, 0.03, 0.08, pose=upright(np.array([-0.045, 0.135]), 0.08, 0.0)),
         Box((0.045, 0.035, 0.03), pose=upright(np.array([0.09, -0.01]), 0.03, 0.7)),
         sphere(0.037, upright(np.array([0.075, -0.125]), 0.037, 0.0)),
         cylinder(0.033, 0.09, upright(np.array([-0.05, -0.175]), 0.09, 0.0)),
-    ]
+    )
     camera = Camera.orbit(np.array([0.0, 0.0, 0.06]), 0.95, np.deg2rad(200.0), np.deg2rad(38.0))
-    return Scene(tuple(solids), (1, 2, 3, 4, 5, 6), camera, DepthNoise(), 7, "demo")
+    return Scene(solids, (1, 2, 3, 4, 5, 6), camera, DepthNoise(), 7, "demo")

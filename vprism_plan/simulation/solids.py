@@ -6,12 +6,14 @@ transform to the world, metres). Distances are negative inside.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
+
+from vprism_plan._arguments import choice
 
 if TYPE_CHECKING:
     import trimesh
@@ -34,19 +36,14 @@ class Solid(ABC):
     def _hit(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Smallest positive ray parameter in the local frame, inf for a miss."""
 
-    @abstractmethod
-    def _profile(self) -> np.ndarray | None:
-        """Outline (m, 2) of (radius, z), bottom to top, of a body of revolution."""
+    def _profile(self) -> np.ndarray:
+        """Outline (m, 2) of (radius, z), bottom to top; other bodies bring points and a mesh."""
+        raise NotImplementedError
 
     @property
     @abstractmethod
     def bounding_radius(self) -> float:
         """Radius of the ball around the solid's origin that encloses it, metres."""
-
-    @property
-    @abstractmethod
-    def _sizes(self) -> dict[str, Any]:
-        """Constructor arguments other than the pose, ready for JSON."""
 
     @property
     def center(self) -> Float[np.ndarray, "3"]:
@@ -76,19 +73,15 @@ class Solid(ABC):
         for axis in range(3):
             step = np.zeros(3)
             step[axis] = h
-            gradient[:, axis] = self.signed_distance(points + step) - self.signed_distance(
-                points - step
-            )
+            ahead, behind = self.signed_distance(points + step), self.signed_distance(points - step)
+            gradient[:, axis] = ahead - behind
         length = np.linalg.norm(gradient, axis=1, keepdims=True)
         return gradient / np.maximum(length, 1e-300)
 
     def surface_points(self, spacing: float) -> Float[np.ndarray, "m 3"]:
         """Return world points on the surface, neighbours at most about `spacing` metres apart."""
-        profile = self._profile()
-        if profile is None:
-            raise NotImplementedError(f"{self.kind} must bring its own surface_points")
         ring = []
-        for (r0, z0), (r1, z1) in pairwise(profile):
+        for (r0, z0), (r1, z1) in pairwise(self._profile()):
             n = max(1, int(np.ceil(np.hypot(r1 - r0, z1 - z0) / spacing)))
             for s in np.linspace(0.0, 1.0, n + 1):
                 r, z = r0 + s * (r1 - r0), z0 + s * (z1 - z0)
@@ -100,16 +93,15 @@ class Solid(ABC):
         return self._to_world(np.concatenate(ring))
 
     def mesh(self) -> "trimesh.Trimesh":
-        """Return a watertight triangle mesh in the world frame (curved faces in 64 segments)."""
+        """Return a watertight triangle mesh in the world frame, curved faces in 64 segments."""
         import trimesh
 
-        profile = self._profile()
-        assert profile is not None
-        return trimesh.creation.revolve(profile, sections=_SEGMENTS, transform=self.pose)
+        return trimesh.creation.revolve(self._profile(), sections=_SEGMENTS, transform=self.pose)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a JSON-ready description that `solid_from_dict` reads back exactly."""
-        return {"kind": self.kind, **self._sizes, "pose": self.pose.tolist()}
+        sizes = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "pose"}
+        return {"kind": self.kind, **sizes, "pose": self.pose.tolist()}
 
     def _to_world(self, p: np.ndarray) -> np.ndarray:
         return p @ self.pose[:3, :3].T + self.center
@@ -126,13 +118,6 @@ class Box(Solid):
     def bounding_radius(self) -> float:
         """Half the space diagonal, metres."""
         return float(np.linalg.norm(self.half_extents))
-
-    @property
-    def _sizes(self) -> dict[str, Any]:
-        return {"half_extents": list(self.half_extents)}
-
-    def _profile(self) -> None:
-        return None
 
     def _distance(self, p: np.ndarray) -> np.ndarray:
         q = np.abs(p) - np.asarray(self.half_extents)
@@ -185,14 +170,6 @@ class Frustum(Solid):
     def bounding_radius(self) -> float:
         """Distance from the middle of the axis to the farther rim, metres."""
         return float(np.hypot(max(self.bottom_radius, self.top_radius), self.half_height))
-
-    @property
-    def _sizes(self) -> dict[str, Any]:
-        return {
-            "bottom_radius": self.bottom_radius,
-            "top_radius": self.top_radius,
-            "half_height": self.half_height,
-        }
 
     def _profile(self) -> np.ndarray:
         h = self.half_height
@@ -252,10 +229,6 @@ class Capsule(Solid):
         """Half length of the segment plus the radius, metres."""
         return self.radius + self.half_length
 
-    @property
-    def _sizes(self) -> dict[str, Any]:
-        return {"radius": self.radius, "half_length": self.half_length}
-
     def _profile(self) -> np.ndarray:
         quarter = np.linspace(-np.pi / 2, 0.0, _SEGMENTS // 4 + 1)
         lower = self.radius * np.stack([np.cos(quarter), np.sin(quarter)], 1)
@@ -310,14 +283,8 @@ def sphere(radius: float, pose: np.ndarray | None = None) -> Capsule:
 
 def solid_from_dict(data: dict[str, Any]) -> Solid:
     """Rebuild a solid from `Solid.to_dict`; raises ConfigError for an unknown kind."""
-    pose = np.asarray(data["pose"], dtype=np.float64)
-    if data["kind"] == Box.kind:
-        x, y, z = data["half_extents"]
-        return Box((x, y, z), pose=pose)
-    if data["kind"] == Frustum.kind:
-        return Frustum(data["bottom_radius"], data["top_radius"], data["half_height"], pose=pose)
-    if data["kind"] == Capsule.kind:
-        return Capsule(data["radius"], data["half_length"], pose=pose)
-    from vprism_plan.errors import ConfigError
-
-    raise ConfigError(f"solid kind {data['kind']!r} is unknown; valid: box, frustum, capsule")
+    kinds = {solid.kind: solid for solid in (Box, Frustum, Capsule)}
+    kind = kinds[choice("kind of solid", data["kind"], kinds)]
+    sizes = {f.name: data[f.name] for f in fields(kind) if f.name != "pose"}
+    sizes = {k: tuple(v) if isinstance(v, list) else v for k, v in sizes.items()}
+    return kind(**sizes, pose=np.asarray(data["pose"], dtype=np.float64))

@@ -69,10 +69,7 @@ class ObjectFrame:
 
 
 def prepare_cloud(
-    points: Float[np.ndarray, "n 3"],
-    plane: Plane,
-    camera_center: Float[np.ndarray, "3"],
-    size: int,
+    points: Float[np.ndarray, "n 3"], plane: Plane, camera_center: Float[np.ndarray, "3"], size: int
 ) -> tuple[Float32[np.ndarray, "m 3"], ObjectFrame]:
     """Normalise the world points (m) seen of one object.
 

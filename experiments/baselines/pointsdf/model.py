@@ -16,19 +16,19 @@ to draw what was seen sharply; `Architecture(nearest=0, octaves=0)` is the publi
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from experiments.baselines.pointsdf.cloud import CONTEXT
+from experiments.stored import Stored
 from vprism_plan.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class Architecture:
+class Architecture(Stored):
     """Sizes of the network.
 
     Attributes:
@@ -71,16 +71,6 @@ class Architecture:
             )
         if self.depth < 2:
             raise ConfigError(f"depth is {self.depth}; the head needs at least 2 layers")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all sizes, ready for JSON; `from_dict` reads them back."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Rebuild from `to_dict`, also after JSON made lists of tuples."""
-        sizes: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-        return cls(**sizes)
 
 
 _OFFSET_GAIN = 4.0

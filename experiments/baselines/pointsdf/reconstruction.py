@@ -10,6 +10,7 @@ from jaxtyping import Float
 from experiments.baselines.pointsdf.cloud import ObjectFrame, prepare_cloud
 from experiments.baselines.pointsdf.model import PointSDF
 from experiments.baselines.pointsdf.weights import shipped_network
+from experiments.protocols import checked_points
 from vprism_plan.errors import MapError
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane_fitting import fit_plane
@@ -50,9 +51,7 @@ class PointSdfReconstruction:
         Raises:
             MapError: points of another shape, or not finite.
         """
-        points = np.asarray(points, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise MapError(f"points have shape {points.shape}; give finite (n, 3), metres")
+        points = checked_points(points, MapError)
         proba = np.zeros((len(points), 1 + len(self.object_ids)))
         for k, frame in enumerate(self.frames):
             local = frame.to_object(points)

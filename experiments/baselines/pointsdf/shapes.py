@@ -13,8 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.placement import random_solid
-from vprism_plan.simulation.scenes import Scene
+from vprism_plan.simulation.scenes import Scene, random_solid
 from vprism_plan.simulation.solids import Box, Capsule, Frustum, Solid, cylinder
 
 Body = tuple[Solid, ...]  # the solids of one object

@@ -5,8 +5,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -57,10 +56,6 @@ class Schedule:
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all settings, ready for JSON."""
-        return asdict(self)
-
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ..."""
         rise = min(1.0, (step + 1) / max(self.warmup, 1))
@@ -89,14 +84,6 @@ class Look:
         end (`calibrated`).
         """
         return float(np.mean(list(self.iou.values()), axis=0).max())
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, ready for JSON."""
-        return {
-            "step": self.step,
-            "loss": self.loss,
-            "iou": {k: list(v) for k, v in self.iou.items()},
-        }
 
 
 def train(
