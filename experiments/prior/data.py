@@ -19,7 +19,7 @@ from experiments.prior.shapes import TrainingShapes
 from vprism_plan.mapping.shape_network import CHANNELS, SIDE, Crop, crop_features
 from vprism_plan.perception.observation import Observation
 from vprism_plan.simulation.camera import Camera, DepthNoise
-from vprism_plan.simulation.placement import upright
+from vprism_plan.simulation.scenes import upright
 
 FIRST_SEED, HELD_OUT_SEED = 500_000, 590_000
 _PER_FILE = 10  # scenes

@@ -129,7 +129,9 @@ def test_what_was_seen_overrules_the_guess(scene, default_map):
         assert free.sum() > 100
         assert np.quantile(fitted.occupancy(inside[free]), 0.9) < 0.5
         own = points[labels == k]
-        assert np.mean(fitted.occupancy(own) > 0.3) > np.mean(default_map.occupancy(own) > 0.3) - 0.2
+        assert (
+            np.mean(fitted.occupancy(own) > 0.3) > np.mean(default_map.occupancy(own) > 0.3) - 0.2
+        )
 
 
 def test_with_a_prior_the_questions_agree(guessed, query):
