@@ -23,7 +23,7 @@ from vprism_plan.errors import RobotError
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scenes import Scene
 from vprism_plan.simulation.solids import Box
-from vprism_plan.world.known import HalfSpace, Sphere
+from vprism_plan.world.config import HalfSpace, Sphere
 
 SLIDER = """<robot name="slider">
   <link name="world"/><link name="x"/><link name="y"/>

@@ -14,7 +14,6 @@ from vprism_plan.collision.reports import SPOKEN, Kind, kind_of
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses, joint_values
 from vprism_plan.world.distance import DistanceField
-from vprism_plan.world.source_fields import source_field
 
 _CHUNK = 512  # configurations whose spheres are in memory at once
 
@@ -228,7 +227,7 @@ def obstacles_of(world: Any, without: frozenset[int] = frozenset()) -> tuple[Obs
         for name, row in zip(world.plane_names, world.planes, strict=True)
     ]
     for name in world.sources:
-        field = source_field(world, name, without)
+        field = world.source_field(name, without)
         if field.source.flat[0] >= 0:
             found.append(Obstacle(name, kind_of(name), field=field))
     return tuple(found)

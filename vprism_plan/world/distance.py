@@ -2,7 +2,7 @@
 """Distance to the obstacles on a grid of nodes, and bounds between the nodes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,8 @@ from vprism_plan.world.grid import Grid
 
 if TYPE_CHECKING:
     import torch
+
+_MAX_LATTICE = 400_000_000
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,16 @@ class Lattice:
     labels: UInt8[np.ndarray, "x y z"]
     corner: Int[np.ndarray, " 3"]
     factor: int
+
+
+def lattice_nodes(shape: Int[np.ndarray, " 3"], what: str) -> UInt8[np.ndarray, "x y z"]:
+    """Return unmarked nodes of a lattice; WorldError if it would be too large to be of use."""
+    if math.prod(int(n) for n in shape) > _MAX_LATTICE:
+        raise WorldError(
+            f"{what} spans {' x '.join(str(int(n)) for n in shape)} lattice nodes (at most "
+            f"{_MAX_LATTICE:,}); use a coarser resolution"
+        )
+    return np.zeros(tuple(shape), dtype=np.uint8)
 
 
 def distance_to_lattice(
@@ -229,13 +241,21 @@ def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
     return NodeDistances(distance, source)
 
 
-def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
-    """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
+def at_nodes(
+    grid: Grid, bound: Callable[[np.ndarray], np.ndarray]
+) -> Float32[np.ndarray, "nx ny nz"]:
+    """Bounds of a distance at all nodes, at least 0 and rounded down."""
     distance = np.empty(grid.shape, dtype=np.float32)
     for start in range(0, grid.shape[0], 16):
         stop = min(start + 16, grid.shape[0])
-        bound = np.maximum(field.lower_bound(grid.slab(start, stop)), 0.0)
-        distance[start:stop] = round_down(bound).reshape(-1, *grid.shape[1:])
+        outside = np.maximum(bound(grid.slab(start, stop)), 0.0)
+        distance[start:stop] = round_down(outside).reshape(-1, *grid.shape[1:])
+    return distance
+
+
+def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
+    """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
+    distance = at_nodes(grid, field.lower_bound)
     ends = (np.stack([grid.origin, grid.upper]) - field.origin) / field.spacing
     nearest = [
         np.clip(np.rint(np.linspace(first, last, n)), 0, size - 1).astype(int)
@@ -260,11 +280,11 @@ def finish(
     inside = distance <= 0.0
     reach = float(np.linalg.norm(grid.upper - grid.origin)) + grid.spacing
     if inside.any():
-        box = _bounding(inside, margin=1)
+        box = bounding(inside, 1)
         part = Grid(
             grid.spacing,
             grid.first + np.array([s.start for s in box]),
-            _shape3(inside[box].shape),
+            inside[box].shape,
         )
         # Nodes on the rim of the box are the nearest outside ones only if they are outside.
         depth, _ = distance_to_lattice(
@@ -281,19 +301,11 @@ def finish(
     )  # fmt: skip
 
 
-def _bounding(mask: np.ndarray, margin: int) -> tuple[slice, slice, slice]:
+def bounding(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
     """Slices of the box of the true entries, grown by a margin within the array."""
-    slices = []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        hits = np.flatnonzero(mask.any(axis=others))
-        slices.append(
-            slice(max(0, int(hits[0]) - margin), min(mask.shape[axis], int(hits[-1]) + 1 + margin))
-        )
-    return slices[0], slices[1], slices[2]
-
-
-def _shape3(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    if len(shape) != 3 or math.prod(shape) == 0:
-        raise WorldError(f"a grid needs three non-empty axes, got shape {shape}")
-    return shape[0], shape[1], shape[2]
+    axes = range(mask.ndim)
+    hits = [np.flatnonzero(mask.any(axis=tuple(b for b in axes if b != a))) for a in axes]
+    return tuple(
+        slice(max(0, int(where[0]) - margin), min(n, int(where[-1]) + 1 + margin))
+        for where, n in zip(hits, mask.shape, strict=True)
+    )

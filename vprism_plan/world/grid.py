@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 
 from vprism_plan.errors import WorldError
 from vprism_plan.perception import Plane
-from vprism_plan.world.config import WorldConfig
-from vprism_plan.world.known import HalfSpace
+from vprism_plan.world.config import HalfSpace, WorldConfig
 
 _REACH = 0.6  # metres of room around the observed objects
 _UNDER = 0.02  # metres below the support plane
@@ -51,6 +50,20 @@ class Grid:
         sizes = (stop - start, *self.shape[1:])
         nodes = np.moveaxis(np.indices(sizes), 0, -1).reshape(-1, 3)
         return self.spacing * (nodes + self.first + np.array([start, 0, 0])).astype(np.float64)
+
+
+def window(low: np.ndarray, high: np.ndarray) -> tuple[slice, slice, slice]:
+    """Slices of an array from one corner up to another."""
+    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return x, y, z
+
+
+def corners(shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
+    """Windows of an array of nodes: the eight corners of all its cells."""
+    return [
+        tuple(slice(bit, n - 1 + bit) for bit, n in zip(bits, shape, strict=True))
+        for bits in np.ndindex(2, 2, 2)
+    ]
 
 
 def is_level(plane: Plane | None) -> bool:

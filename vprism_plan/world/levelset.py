@@ -10,13 +10,16 @@ differences of a smooth function, counted twice: not a proof for an arbitrary on
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from vprism_plan._kernels import world as kernels
 from vprism_plan.errors import WorldError
+from vprism_plan.world.distance import Lattice, lattice_nodes
 
 # How far the second derivatives may exceed their finite-difference estimate.
 _CURVATURE_SAFETY = 2.0
@@ -26,8 +29,8 @@ _CHUNK = 1 << 16
 # Cells of a surface, a kilobyte each: about 3 square metres at a resolution of 1 mm.
 _MOST_CELLS = 8_000_000
 
-_OFFSETS = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(27, 3)
-_CHILDREN = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+_OFFSETS = np.indices((3, 3, 3)).reshape(3, 27).T
+_CHILDREN = np.indices((2, 2, 2)).reshape(3, 8).T
 # Values of the parabola through three nodes at the nodes and half way between them.
 _HALVES = np.array(
     [[1, 0, 0], [0.375, 0.75, -0.125], [0, 1, 0], [-0.125, 0.75, 0.375], [0, 0, 1]], dtype=float
@@ -62,19 +65,18 @@ class LevelSet:
 
     Attributes:
         spacing: of the lattice, metres.
-        inner: cells that lie wholly inside, by size.
-        border: cells of one lattice step in which the level may be reached.
+        cells: those that lie wholly inside, by size, and last those of one lattice step in
+            which the level may be reached.
         evaluations: how many points of the map were evaluated.
     """
 
     spacing: float
-    inner: tuple[Cells, ...]
-    border: Cells
+    cells: tuple[Cells, ...]
     evaluations: int
 
     def box(self) -> tuple[Int[np.ndarray, " 3"], Int[np.ndarray, " 3"]] | None:
         """First and last lattice node of the cover, or None if it is empty."""
-        parts = [cells for cells in (*self.inner, self.border) if len(cells.index)]
+        parts = [cells for cells in self.cells if len(cells.index)]
         if not parts:
             return None
         lower = np.min([cells.index.min(axis=0) for cells in parts], axis=0)
@@ -110,12 +112,10 @@ def _unique_nodes(
     """Distinct lattice nodes, and where each given one is among them."""
     low = nodes.reshape(-1, 3).min(axis=0)
     extent = nodes.reshape(-1, 3).max(axis=0) - low + 1
-    shifted = nodes - low
-    keys = (shifted[..., 0] * extent[1] + shifted[..., 1]) * extent[2] + shifted[..., 2]
+    keys = np.ravel_multi_index(tuple(np.moveaxis(nodes - low, -1, 0)), tuple(extent))
     unique, inverse = np.unique(keys.reshape(-1), return_inverse=True)
-    rest, z = np.divmod(unique, extent[2])
-    x, y = np.divmod(rest, extent[1])
-    return np.stack([x, y, z], axis=1) + low, inverse.reshape(keys.shape)
+    found = np.stack(np.unravel_index(unique, tuple(extent)), axis=1)
+    return found + low, inverse.reshape(keys.shape)
 
 
 def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Float[np.ndarray, " n"]:
@@ -125,11 +125,6 @@ def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Float[np.ndarray, " n"]:
         second = np.abs(np.diff(g, n=2, axis=axis))
         total += second.reshape(len(g), -1).max(axis=1, initial=0.0)
     return total
-
-
-def _range(g: Float[np.ndarray, "n 3 3 3"]) -> Float[np.ndarray, " n"]:
-    flat = g.reshape(len(g), -1)
-    return np.asarray(flat.max(axis=1) - flat.min(axis=1))
 
 
 def lattice_refinement(resolution: float, kernel_length: float) -> int:
@@ -184,13 +179,12 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         owners = labels[where].reshape(-1, 3, 3, 3)
         step = spacing * size / map_.kernel_length
         if size == 2:
-            return LevelSet(spacing, tuple(inner), _border(index, g, owners, step), evaluations)
+            return LevelSet(spacing, (*inner, _border(index, g, owners, step)), evaluations)
         inside, border = _divide(index, size, g, owners, step)
         inner.append(inside)
         index = border.index
         if len(index) == 0:
-            nothing = Cells(index, 1, border.label, border.around)
-            return LevelSet(spacing, tuple(inner), nothing, evaluations)
+            return LevelSet(spacing, tuple(inner), evaluations)
 
 
 def _divide(
@@ -204,8 +198,9 @@ def _divide(
 
     Children with more than one object at their corners are divided too.
     """
+    spread = np.ptp(g, axis=(1, 2, 3))
     # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
-    slack = _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * _range(g) + _SLACK
+    slack = _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
     inside, border = [], []
     for child in _CHILDREN:
         block = (slice(None), *(slice(c, c + 2) for c in child))
@@ -248,7 +243,8 @@ def _border(
     """
     fine = np.einsum("ai,bj,ck,nijk->nabc", _HALVES, _HALVES, _HALVES, g, optimize=True)
     # Second differences at half the spacing are a quarter of those in `g`.
-    slack = _CURVATURE_SAFETY * _curvature(g) / 32.0 + 0.3 * step**2 * _range(g) + _SLACK
+    spread = np.ptp(g, axis=(1, 2, 3))
+    slack = _CURVATURE_SAFETY * _curvature(g) / 32.0 + 0.3 * step**2 * spread + _SLACK
     kept = []
     for child in np.ndindex(4, 4, 4):
         corners = fine[(slice(None), *(slice(c, c + 2) for c in child))].reshape(len(g), 8)
@@ -267,3 +263,31 @@ def _join(parts: list[Cells]) -> Cells:
         np.concatenate([part.label for part in parts]),
         np.concatenate([part.around for part in parts]),
     )
+
+
+def rasterize_level_set(
+    level_set: LevelSet, factor: int, classes: Collection[int] | None = None
+) -> Lattice | None:
+    """Mark the corners of the cells of a level set with the object class found there.
+
+    With `classes`, only cells in which one of these classes is the most probable at
+    some corner, and the whole of such cells. None if there is no cell.
+    """
+    cells = level_set.cells
+    if classes is not None:
+        cells = tuple(_owned(part, classes) for part in cells)
+    box = LevelSet(level_set.spacing, cells, 0).box()
+    if box is None:
+        return None
+    lower, upper = box
+    labels = lattice_nodes(upper - lower + 1, "the level set")
+    for part in cells:
+        kernels.fill_blocks(labels, part.index - lower, part.label, part.size)
+    return Lattice(labels, lower, factor)
+
+
+def _owned(cells: Cells, classes: Collection[int]) -> Cells:
+    """Cells with one of the classes at some corner around them, relabelled with it."""
+    mine = np.isin(cells.around, np.array(sorted(classes), dtype=cells.around.dtype))
+    label = np.where(mine, cells.around, 0).max(axis=1, initial=0)
+    return Cells(cells.index, cells.size, label, cells.around).select(label > 0)

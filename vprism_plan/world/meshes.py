@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
+from scipy import ndimage
 
+from vprism_plan._arguments import number, whole
 from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.world.config import check_level
+from vprism_plan.world.grid import corners, window
 
 if TYPE_CHECKING:
     import trimesh
@@ -40,23 +43,14 @@ def extract_meshes(
         WorldError: a surface could not be closed.
     """
     probabilities, origin = _sample(map, level, resolution)
-    occupied = probabilities[..., 1:].sum(axis=-1) - level
     meshes = {}
     for k, object_id in enumerate(map.object_ids, start=1):
-        inside = occupied
-        if len(map.object_ids) > 1:
-            others = np.delete(probabilities, (0, k), axis=-1).max(axis=-1)
-            inside = np.minimum(occupied, probabilities[..., k] - others)
-        mesh = surface(inside, origin, resolution)
-        if mesh is None:
-            _log.warning(
-                "object %d has no surface at level %g on a grid of %g m: left out",
-                object_id,
-                level,
-                resolution,
-            )
-            continue
-        meshes[object_id] = mesh
+        mesh = surface(_inside(probabilities, k, level), origin, resolution)
+        if mesh is not None:
+            meshes[object_id] = mesh
+        else:
+            why = "object %d has no surface at level %g on a grid of %g m: left out"
+            _log.warning(why, object_id, level, resolution)
     return meshes
 
 
@@ -113,7 +107,6 @@ def surface(
     )
 
 
-_CORNERS = tuple(itertools.product((0, 1), repeat=3))
 # Outside, for nodes that nobody has to evaluate.
 _NOTHING = -0.1
 
@@ -143,8 +136,7 @@ def extract_refined_meshes(
     check_spacing(spacing, "spacing")
     if halvings is None:
         halvings = max(0, math.floor(math.log2(0.5 * map.kernel_length / spacing)))
-    if not 0 <= halvings <= 8:
-        raise ConfigError(f"halvings is {halvings}; it must be between 0 and 8")
+    whole("halvings", halvings, 0, 8)
     lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map.support_bounds())
     probabilities, first = sample_box(map, lower, upper, spacing * 2**halvings, "spacing")
     meshes = {}
@@ -181,8 +173,7 @@ def _cropped(
     hits = np.argwhere(values > 0)
     low = np.maximum(hits.min(axis=0) - 3, 0)
     high = np.minimum(hits.max(axis=0) + 4, values.shape)
-    window = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    return values[window].copy(), first + low
+    return values[window(low, high)].copy(), first + low
 
 
 def _halved(
@@ -195,11 +186,8 @@ def _halved(
     spacing: float,
     wide: bool,
 ) -> tuple[Float[np.ndarray, "mx my mz"], Int[np.ndarray, " 3"]]:
-    """Values on nodes half as far apart, evaluated where the surface may run.
-
-    `halvings` still to come, this one included; `corner` in steps of the given grid; if
-    `wide`, the cells around those in which the surface runs are evaluated, too.
-    """
+    """Values on nodes half as far apart, evaluated where the surface may run, if `wide` in the
+    cells around as well; `halvings` still to come, `corner` in steps of the given grid."""
     check_size(2 * np.array(values.shape), spacing, "spacing")
     mixed = _mixed(values, wide)
     fine = _between(values)
@@ -220,12 +208,8 @@ def _halved(
 
 def _mixed(values: Float[np.ndarray, "nx ny nz"], wide: bool) -> Bool[np.ndarray, "cx cy cz"]:
     """Cells with corners on both sides; if `wide`, the cells around them, too."""
-    from scipy import ndimage
-
     positive = values > 0
-    shape = tuple(n - 1 for n in values.shape)
-    views = [positive[tuple(slice(c, c + n) for c, n in zip(o, shape, strict=True))]
-             for o in _CORNERS]  # fmt: skip
+    views = [positive[corner] for corner in corners(values.shape)]
     some, every = np.logical_or.reduce(views), np.logical_and.reduce(views)
     mixed = some & ~every
     if wide:
@@ -250,8 +234,7 @@ _MAX_NODES = 60_000_000
 
 def check_spacing(spacing: float, name: str) -> None:
     """Raise ConfigError, calling it by its name, unless nodes can be so many metres apart."""
-    if not 1e-4 <= spacing <= 1.0:
-        raise ConfigError(f"{name} is {spacing}; it must be between 0.0001 and 1 metres")
+    number(name, spacing, 1e-4, 1.0, "metres")
 
 
 def check_size(shape: Any, spacing: float, name: str, most: int = _MAX_NODES) -> None:
@@ -280,20 +263,12 @@ def sample_box(
     name: str,
     most: int = _MAX_NODES,
 ) -> tuple[Float32[np.ndarray, "nx ny nz k"], Int[np.ndarray, " 3"]]:
-    """Return class probabilities over a box and a layer around it in which all is empty.
-
-    Args:
-        source: a `VPrismMap`, or what else has `object_ids` and `predict_proba`.
-        lower, upper: corners, metres.
-        spacing: of the nodes, which are whole multiples of it, metres.
-        name: what the user calls the spacing.
-        most: nodes.
-
-    Returns:
-        The probabilities, and the first node in steps.
+    """Return class probabilities over a box (corners, metres) and a layer around it in which
+    all is empty, at whole multiples of the spacing (metres; `name` is what the user calls it),
+    and the first node in steps. `source` has `object_ids` and `predict_proba`.
 
     Raises:
-        ConfigError: too many nodes.
+        ConfigError: more than `most` nodes.
     """
     first = np.floor(lower / spacing).astype(np.int64) - 1
     shape = np.ceil(upper / spacing).astype(np.int64) + 2 - first

@@ -11,6 +11,7 @@ surface.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
@@ -20,7 +21,9 @@ from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception import Observation, Plane
-from vprism_plan.perception.camera import height_sigma, pixel_rays
+from vprism_plan.perception.camera import height_sigma, inlier_band, pixel_rays
+from vprism_plan.perception.plane import TableRegion, table_region
+from vprism_plan.world.distance import bounding
 from vprism_plan.world.grid import Grid
 from vprism_plan.world.visibility import THIN, beside
 
@@ -31,32 +34,21 @@ _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point ma
 Surface = tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]
 
 
-def surface_points(
-    views: Sequence[Observation],
-    object_ids: Sequence[int],
-    plane: Plane | None,
-    bounded: bool = False,
-) -> list[Surface]:
-    """Return, per object and view, the observed points of its surface.
+def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
+    """Return class, observed points of its surface (world, metres) and half the width of their
+    pixels, per object and view of a map.
 
     Points less than 3 mm (or three standard deviations of the noise) above the support surface
     are its own, and points that stand alone are flying pixels, unless they are beside others.
-
-    Args:
-        views: what was fitted.
-        object_ids: labels of the map's classes 1, 2, ...
-        plane: support surface.
-        bounded: whether the support surface ends, so that what is lower counts as well.
-
-    Returns:
-        Class, points (world, metres) and half the width of their pixels.
+    What is lower counts as well if the support surface is `bounded`.
     """
     found = []
-    for view in views:
+    plane = map_.plane
+    for view in map_.views:
         points, labels = view.points()
         depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-        for k, object_id in enumerate(object_ids, start=1):
+        for k, object_id in enumerate(map_.object_ids, start=1):
             own = np.flatnonzero(labels == object_id)
             own = own[beside(points[own], ~stray_points(points[own], _STRAY_SHARE))]
             if plane is not None:
@@ -73,13 +65,6 @@ def off_level_set(
 ) -> Bool[np.ndarray, " n"]:
     """Which points lie more than 4 mm off the level set, by the distance of every grid node to
     it (metres). Nearer ones are its own business: marking them would only thicken it."""
-    return _bound(points, distance, grid) > _OFF
-
-
-def _bound(
-    points: Float[np.ndarray, "n 3"], distance: Float32[np.ndarray, "nx ny nz"], grid: Grid
-) -> Float[np.ndarray, " n"]:
-    """Lower bound of each point's distance to the level set, metres."""
     out = np.empty(len(points))
 
     def look(piece: slice) -> None:
@@ -88,7 +73,7 @@ def _bound(
         )
 
     run_chunked(look, len(points), 1 << 14)
-    return out
+    return out > _OFF
 
 
 _TALLEST = 0.4  # metres above the support surface; what stands on a table is rarely taller
@@ -140,7 +125,7 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     found: list[Cone] = []
     for object_id in lost_objects(view):
         whole = view.labels == object_id
-        window = _window(whole, _HOLE)
+        window = bounding(whole, _HOLE)
         mask, depth = whole[window], view.depth[window].astype(np.float64)
         lost = mask & (depth == 0)
         lost &= ~ndimage.binary_closing(mask & ~lost, np.ones((_HOLE, _HOLE), dtype=bool))
@@ -160,15 +145,6 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
         pixels = np.argwhere(lost) + np.array([w.start for w in window])
         found.append(Cone(object_id, pixels, rays[lost], start[lost], end[lost]))
     return found
-
-
-def _window(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the mask's box, grown by a margin within the image."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
-        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
-    )
 
 
 def lost_points(
@@ -260,3 +236,42 @@ def _before_foot(
     with np.errstate(divide="ignore", invalid="ignore"):
         at_front = np.where(along > 0.0, front / along, 0.0)
     return np.maximum(np.maximum(below_top, at_front), 0.0)
+
+
+RIM = 0.05  # metres around the seen part of the support surface that count as part of it
+_BAND = 0.01  # metres at a depth of 1 m within which a point is of the surface
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSupport:
+    """Everything under the convex hull (`region`), grown by `RIM`, of what was seen of a plane."""
+
+    plane: Plane
+    region: TableRegion
+
+    def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Lower bound of the distance from world points, metres, negative inside.
+
+        Exact but for points beyond a corner of the hull.
+        """
+        flat = points @ self.region.axes.T
+        beside = np.full(len(points), -np.inf)
+        for a, b, c in self.region.halfplanes:
+            np.maximum(beside, flat @ np.array([a, b]) + c - RIM, out=beside)
+        above = self.plane.signed_distance(points)
+        outside = np.hypot(np.maximum(beside, 0.0), np.maximum(above, 0.0))
+        return np.asarray(outside + np.minimum(np.maximum(beside, above), 0.0))
+
+
+def seen_support(views: Sequence[Observation], plane: Plane) -> SeenSupport:
+    """Bound a support plane to what the views saw of it.
+
+    Raises:
+        PlaneNotFoundError: they saw no patch of 6 cm x 6 cm of it.
+    """
+    kept = [np.empty((0, 3))]
+    for view in views:
+        points, labels = view.points()
+        band = inlier_band(view.depth[view.depth > 0], _BAND)
+        kept.append(points[(np.abs(plane.signed_distance(points)) < band) & (labels == 0)])
+    return SeenSupport(plane, table_region(plane, np.concatenate(kept)))

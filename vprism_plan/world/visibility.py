@@ -20,6 +20,7 @@ from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points
 from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.grid import window
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
 _NEAR = 0.1
@@ -39,15 +40,9 @@ def free_balls(observations: Iterable[Observation]) -> Float[np.ndarray, "s 4"]:
 def speaking_against(
     observation: Observation, things: Bool[np.ndarray, "h w"], balls: Float[np.ndarray, "s 4"]
 ) -> Float[np.ndarray, "h w"]:
-    """Depth (metres) of the pixels behind which the balls are not believed, inf elsewhere.
-
-    These are what shows a thing within 10 cm of a ball, and all that shows the same object.
-
-    Args:
-        observation: a view.
-        things: pixels that show neither the robot nor the support surface.
-        balls: of `free_balls`, all views together.
-    """
+    """Depth (metres) of the pixels behind which the balls are not believed, inf elsewhere: what
+    of the things (neither robot nor support surface) shows something within 10 cm of a ball of
+    any view, and all that shows the same object."""
     near = np.zeros(observation.shape, dtype=bool)
     if not len(balls):
         return np.full(observation.shape, np.inf)
@@ -70,14 +65,14 @@ def cells_within(
     high = np.ceil(((balls[:, :3] + balls[:, 3:]).max(axis=0) - origin) / spacing)
     low = np.clip(low, 0, shape).astype(np.int64)
     high = np.clip(high, low, shape).astype(np.int64)
-    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
     marked = np.zeros(tuple(high - low), dtype=bool)
     kernels.mark_cells_within(balls, origin + spacing * low, spacing, marked)
-    return (x, y, z), marked
+    return window(low, high), marked
 
 
-# Codes of points.
+# Codes of points, and the names of space that nobody has seen.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
+UNSEEN = {OCCLUDED: "occluded", UNOBSERVED: "unobserved", OUTSIDE: "outside"}
 # Of a point, a kernel's "partly" means that some pixel around it has the point in shadow.
 _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
@@ -140,13 +135,11 @@ def make_view(
 ) -> View:
     """Prepare an observation; `tolerance` (metres) is how far behind a return shadow begins.
 
-    `robots` are the balls of the robots in all views of the scene; None: in this one.
-
-    The tolerance grows with the noise of the sensor: three standard deviations. A ray
-    that ends on the support plane (within that noise) or under it has passed through
-    free space only, as far as space above the plane goes: such pixels cast no shadow,
-    or the coarse cells on a table seen at a glance would all hide behind one another.
-    The robot casts one always, however low it is.
+    `robots` are the balls of the robots in all views of the scene; None: in this one. The
+    tolerance grows with the noise of the sensor: three standard deviations. A ray that ends on
+    the support plane (within that noise) or under it has passed through free space only, as far
+    as space above the plane goes: such pixels cast no shadow, or the coarse cells on a table
+    seen at a glance would all hide behind one another. The robot casts one always.
     """
     depth = np.asarray(observation.depth, dtype=np.float64)
     valid = depth > 0
@@ -169,9 +162,7 @@ def make_view(
 
 
 def _view(
-    observation: Observation,
-    reach: Float[np.ndarray, "h w"],
-    valid: Bool[np.ndarray, "h w"],
+    observation: Observation, reach: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
 ) -> View:
     K, rotation = observation.intrinsics, observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
@@ -189,22 +180,6 @@ def shadow_behind(observation: Observation, start: Float[np.ndarray, "h w"]) -> 
     return _view(observation, start, np.ones(start.shape, dtype=bool))
 
 
-def behind(
-    observation: Observation,
-    start: Float[np.ndarray, "h w"],
-    plane: Plane | None,
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    shape: tuple[int, int, int],
-) -> Bool[np.ndarray, "nx ny nz"]:
-    """Cells (as for `classify_cells`) that reach behind the depth `start` (metres) of a pixel.
-
-    Pixels with an infinite `start` hide nothing.
-    """
-    status = classify_cells([shadow_behind(observation, start)], plane, origin, spacing, shape)
-    return (status == kernels.OCCLUDED) | (status == kernels.PARTLY)
-
-
 def classify_cells_around(
     views: Sequence[View],
     below: Sequence[View],
@@ -213,11 +188,9 @@ def classify_cells_around(
     spacing: float,
     shape: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "nx ny nz"]:
-    """`classify_cells` for a support plane that ends somewhere: what is lower counts as well.
-
-    Above the plane as `views` say, for which it casts no shadow; below, wherever a cell
-    reaches there, as the `below` views say, for which it hides things like any surface.
-    """
+    """`classify_cells` for a support plane that ends somewhere: above it as `views` say, for
+    which it casts no shadow; below, wherever a cell reaches there, as the `below` views say, for
+    which it hides things like any surface."""
     status = classify_cells(views, None, origin, spacing, shape)
     under = classify_cells(below, None, origin, spacing, shape)
     low = 0.5 * spacing * np.abs(plane.normal).sum()
@@ -249,16 +222,9 @@ def classify_cells(
 
         def look(piece: slice, view: View = view) -> None:
             kernels.classify_cells(
-                origin,
-                spacing,
-                view.camera,
-                view.optics,
-                view.reach,
-                view.holes,
-                status,
-                piece.start,
-                piece.stop,
-            )
+                origin, spacing, view.camera, view.optics, view.reach, view.holes, status,
+                piece.start, piece.stop,
+            )  # fmt: skip
 
         run_chunked(look, blocks, 2)
     if plane is not None:
@@ -274,6 +240,11 @@ def classify_cells(
     return status
 
 
+def robot_balls(views: Sequence[View]) -> Float[np.ndarray, "s 4"]:
+    """Balls of the robots in all views."""
+    return np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+
+
 def _clear_robots(
     views: Sequence[View],
     origin: Float[np.ndarray, " 3"],
@@ -281,15 +252,15 @@ def _clear_robots(
     status: UInt8[np.ndarray, "nx ny nz"],
 ) -> None:
     """Call the cells free in which a pictured robot was."""
-    balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+    balls = robot_balls(views)
     if not len(balls):
         return
-    window, robot = cells_within(balls, origin, spacing, status.shape)
-    part = status[window]
+    near, robot = cells_within(balls, origin, spacing, status.shape)
+    part = status[near]
     robot &= part != kernels.FREE
     if not robot.any():
         return
-    corner = origin + spacing * np.array([w.start for w in window])
+    corner = origin + spacing * np.array([w.start for w in near])
     for view in views:
         if view.against is not None:
             code = np.full(part.shape, kernels.UNOBSERVED, dtype=np.uint8)
@@ -311,7 +282,7 @@ def classify_points(
         kernels.classify_points(
             points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
         )
-    balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+    balls = robot_balls(views)
     hidden = np.flatnonzero(status != kernels.FREE) if len(balls) else np.empty(0, dtype=int)
     robot = hidden[within_balls(points[hidden], balls)]
     for view in views:
@@ -345,13 +316,13 @@ def clutter_pixels(
 ) -> Bool[np.ndarray, "h w"]:
     """Which pixels show unlabelled things off the support plane.
 
-    "Off" is `height` metres, or three standard deviations of the depth noise as it
-    shows along the normal, if that is more. Without a plane every unlabelled pixel is.
-    Pixels of the robot are not clutter, nor, if `lone_share` is above 0, are points
-    that with all others off the plane fill less than that share of what a surface facing
-    the camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills
-    3 percent. What lies within 1.5 cm of a point that is none stays: tips and edges lack
-    half their surroundings. Below the plane is "off" as well if the support is `bounded`.
+    "Off" is `height` metres, or three standard deviations of the depth noise along the normal,
+    if that is more; below the plane as well if the support is `bounded`. Without a plane every
+    unlabelled pixel is. Pixels of the robot are not clutter, nor, if `lone_share` is above 0,
+    are points that with all others off the plane fill less than that share of what a surface
+    facing the camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills
+    3 percent. What lies within 1.5 cm of a point that is none stays: tips and edges lack half
+    their surroundings.
     """
     points, labels = view.points()
     valid = view.depth > 0

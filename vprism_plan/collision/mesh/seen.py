@@ -44,7 +44,7 @@ class SeenPoints:
             map_.views, map_.plane, config.background_height, config.lone_share, bounded
         )
         parts = [(0, points, half)]
-        parts += surface_points(map_.views, map_.object_ids, map_.plane, bounded)
+        parts += surface_points(map_, bounded)
         bodies = [("background", SEEN), *((f"object:{i}", SEEN) for i in map_.object_ids)]
         step, judged = config.resolution, judged_field(world)
         for view in map_.views:

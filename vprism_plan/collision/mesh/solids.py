@@ -13,7 +13,7 @@ from vprism_plan.collision.mesh.fcl import Shape, point_distance, point_within
 from vprism_plan.collision.packing import reach_table
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot
-from vprism_plan.world.rasterize import winding_number
+from vprism_plan.world.marks import winding_number
 
 LinkShapes = Literal["geometry", "spheres"]
 _MOST_PIECES = 20

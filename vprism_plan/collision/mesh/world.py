@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.collision.mesh.fcl import Shape
-from vprism_plan.world.known import Box, Cylinder, KnownMesh, Sphere
+from vprism_plan.world.config import Box, Cylinder, KnownMesh, Sphere
 from vprism_plan.world.levelset import lattice_refinement
+from vprism_plan.world.marks import winding_number
 from vprism_plan.world.meshes import extract_refined_meshes
-from vprism_plan.world.rasterize import winding_number
-from vprism_plan.world.support import RIM, SeenSupport, seen_support
-from vprism_plan.world.world import SUPPORT
+from vprism_plan.world.seen import RIM, SeenSupport, seen_support
+from vprism_plan.world.sources import SUPPORT
 
 _DEEP = 5.0  # metres: what is under a surface that ends reaches down farther than any robot
 
