@@ -9,22 +9,29 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vprism_plan._arguments import number
 from vprism_plan._kernels import checking as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.collision import entropy, explain, margins, motion
 from vprism_plan.collision.config import CheckerConfig, contact_rules
-from vprism_plan.collision.draws import Setting
-from vprism_plan.collision.inputs import Numbers, configuration, configurations, waypoints
-from vprism_plan.collision.packing import PackedWorld, pack_robot, pack_world
-from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate, StateReport
-from vprism_plan.collision.risk import PathRisk
+from vprism_plan.collision.packing import (
+    Numbers,
+    PackedWorld,
+    configuration,
+    configurations,
+    pack_robot,
+    pack_world,
+    waypoints,
+)
+from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate
+from vprism_plan.collision.risk import PathRisk, Setting
 from vprism_plan.errors import ConfigError
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 
 
-class CollisionChecker:
+class CollisionChecker(explain.Checker):
     """Answers whether configurations and edges of a robot are free of a world.
 
     A configuration is valid when its joints are within their limits, every collision
@@ -107,30 +114,13 @@ class CollisionChecker:
         self.sphere_clearances(q)
         self.pair_gaps(q)
 
-    def is_valid(self, q: Numbers) -> bool:
-        """Return whether a configuration is free.
-
-        Args:
-            q: (dof,) joint values, radians or metres, in the order of `robot.joint_names`.
-
-        Returns:
-            False also for a configuration that is not finite; ask `explain` why.
-
-        Raises:
-            RobotError: q does not have shape (dof,).
-        """
-        return self.is_valid_buffer(configuration(self.robot, q))
-
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
-        """`is_valid` without looking at the shape: q must be a contiguous float64 (dof,) array.
-
-        The path for planners' inner loops.
-        """
+        """`is_valid` for planners' inner loops: q must be a contiguous float64 (dof,) array."""
         free = kernels.is_valid(q, self._rf, self._ri, *self._world)
         return free and (self._bounded is None or self._bounded.accepts_one(q))
 
     def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
-        """Return `is_valid` for each row of Q (n, dof); runs on all worker threads."""
+        """Return `is_valid` for each row of Q; runs on all worker threads."""
         Q = configurations(self.robot, Q)
         out = np.empty(len(Q), dtype=np.bool_)
 
@@ -150,42 +140,29 @@ class CollisionChecker:
         whatever else the world's policies make an obstacle. The margin is not
         subtracted, and self-collision and joint limits do not enter. It is measured to the
         level set also when `max_risk` decides what is valid; a link's allowed contacts do
-        not count.
-
-        Raises:
-            RobotError: q does not have shape (dof,) or is not finite.
+        not count. RobotError if q is not finite.
         """
         return float(self._clearances(configuration(self.robot, q)[None])[0][0])
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
-        """Return `clearance` for each row of Q (n, dof), metres."""
+        """Return `clearance` for each row of Q, metres."""
         return self._clearances(Q)[0]
 
     def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
         return self._clearances(Q)[1]
 
-    def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
-        """Return whether the straight edge from qa to qb is free, ends included.
-
-        The edge is straight in joint space and means what its ends say: a continuous joint
-        turns by their difference, however often round. It is covered by conservative
-        advancement on the clearances, with every link's displacement bounded from the
-        kinematic chain. Where clearance is so small that the steps fall below
-        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance`
-        metres of motion. With `max_risk`, the worlds that collide anywhere on the edge must
-        be few enough, too.
-
-        Raises:
-            RobotError: An end does not have shape (dof,).
-        """
-        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
-        return self.check_motion_buffer(qa, qb)
-
     def check_motion_buffer(
         self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
     ) -> bool:
-        """`check_motion` for contiguous float64 (dof,) arrays, without looking at shapes."""
+        """`check_motion` for contiguous float64 (dof,) arrays, without looking at shapes.
+
+        Covered by conservative advancement on the clearances, with every link's displacement
+        bounded from the kinematic chain. Where clearance is so small that the steps fall below
+        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance`
+        metres of motion. With `max_risk`, the worlds that collide anywhere on the edge must
+        be few enough, too.
+        """
         return self._check_motion(qa, qb, np.empty(4))
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
@@ -235,8 +212,7 @@ class CollisionChecker:
 
     def with_extra_margin(self, extra: float) -> "CollisionChecker":
         """Return the same checker with `extra` metres (at least 0) more margin."""
-        if not extra >= 0.0:
-            raise ConfigError(f"extra is {extra!r} m; a margin can only be widened")
+        number("extra", extra, 0.0, unit="metres: a margin can only be widened")
         config = replace(self.config, margin=self.config.margin + extra)
         wider = CollisionChecker(self.world, self.robot, config)
         for level in self._levels:
@@ -245,18 +221,19 @@ class CollisionChecker:
             wider = tightened
         return wider
 
-    def explain(self, q: Numbers) -> StateReport:
-        """Return the verdict on a configuration with every reason that refuses it.
+    def contacts(self, q: Numbers) -> tuple[Contact, ...]:
+        """Return every reason to refuse q: the deepest contact of each link and body first,
+        what `max_risk` refuses last."""
+        q = configuration(self.robot, q)
+        found = [*explain.world_contacts(self, q), *explain.self_contacts(self, q)]
+        found += explain.limit_contacts(self.robot, q)
+        return (*explain.by_depth(found), *self._risk_contacts(q))
 
-        Raises:
-            RobotError: q does not have shape (dof,).
-        """
-        return explain.explain(self, configuration(self.robot, q))
+    def _permitted(self, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+        return explain.allowed_contacts(self, q)
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is usable but odd about the world and the robot; every verdict carries it."""
-        return explain.warnings_of(self.world, self.robot)
+    def _centers(self, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
+        return self.sphere_clearances(q)[0]
 
     def verdict_field(self, link: int) -> Any:
         """Return the distance field that verdicts check a link (index) against."""
@@ -361,8 +338,7 @@ class CollisionChecker:
         """Return what probabilities are counted with, for planners' objectives."""
         return self._risk().setting
 
-    def risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
-        """Return what makes a configuration too risky; empty if it is not, or has no bound."""
+    def _risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
         bounded = self._bounded
         if bounded is None or bounded.accepts_one(q):
             return ()

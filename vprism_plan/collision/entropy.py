@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.collision.inputs import Numbers
 from vprism_plan.collision.motion import edges_of, place_points
+from vprism_plan.collision.packing import Numbers
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses
 

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision.inputs import Numbers, checked_tolerance, configurations
 from vprism_plan.collision.motion import edges_of, joint_units, place_points, sphere_jacobians
-from vprism_plan.collision.reports import SPOKEN, Kind, kind_of
+from vprism_plan.collision.packing import Numbers, checked_tolerance, configurations
+from vprism_plan.collision.reports import Kind
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses, joint_values
 from vprism_plan.world.distance import DistanceField
+from vprism_plan.world.sources import object_id, source_of, spoken
 
 _CHUNK = 512  # configurations whose spheres are in memory at once
 
@@ -129,8 +130,7 @@ class SafetyMargins:
         steepest = int(np.argmax(np.abs(margin.gradient)))
         slope = 1000 * margin.gradient[steepest]
         joint = f"{self.joint_names[steepest]} {slope:+.0f} mm/{self.joint_units[steepest]}"
-        unseen = margin.kind in {"occluded", "unobserved"}
-        body = SPOKEN[margin.body] if unseen else margin.body
+        body = spoken(margin.body) if source_of(margin.body).policy else margin.body
         return (
             margin.link,
             body + (" (allowed)" if margin.allowed else ""),
@@ -150,8 +150,7 @@ class Obstacle:
     """One obstacle.
 
     Attributes:
-        name: "object:3", "support surface", "background", "occluded", "unobserved" or
-            "known:NAME".
+        name: as in `World.sources` and `World.plane_names`.
         kind: what it is.
         plane: (4,) normal and offset of a half-space, else None.
         field: distances to everything else, else None.
@@ -222,14 +221,12 @@ def obstacles_of(world: Any, without: frozenset[int] = frozenset()) -> tuple[Obs
     Objects `without` may be touched: occluded space inside them goes. Fields are baked on first
     use: about half a second each for a table top at 1 cm, 6 bytes per node while the world lives.
     """
-    found = [
-        Obstacle(name, kind_of(name), plane=row)
-        for name, row in zip(world.plane_names, world.planes, strict=True)
-    ]
+    planes = zip(world.plane_names, world.planes, strict=True)
+    found = [Obstacle(name, source_of(name).kind, plane=row) for name, row in planes]
     for name in world.sources:
         field = world.source_field(name, without)
         if field.source.flat[0] >= 0:
-            found.append(Obstacle(name, kind_of(name), field=field))
+            found.append(Obstacle(name, source_of(name).kind, field=field))
     return tuple(found)
 
 
@@ -318,7 +315,7 @@ def _rules(checker: Any) -> Iterator[tuple[frozenset[int], Int[np.ndarray, " l"]
 
 
 def _is_allowed(body: Obstacle, rule: frozenset[int]) -> bool:
-    return body.kind == "object" and int(body.name.split(":")[1]) in rule
+    return object_id(body.name) in rule
 
 
 def _scan(
@@ -396,7 +393,7 @@ def _details(
     gradient = np.einsum("nk,nkj->nj", normal, jacobians)
     occupancy: list[float | None] = [None] * len(Q)
     entropy: list[float | None] = [None] * len(Q)
-    if body.kind not in {"support", "known"}:  # of those the map has nothing to say
+    if source_of(body.name).judged:
         occupancy = checker.world.map.occupancy(nearest).tolist()
         entropy = checker.world.map.entropy(nearest).tolist()
     names = "gradient", "nearest", "witness", "occupancy", "entropy"

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.collision.inputs import (
+from vprism_plan.collision.packing import (
     AT_MOST,
     Numbers,
     checked_tolerance,
     configuration,
     configurations,
+    reach_table,
     waypoints,
 )
-from vprism_plan.collision.packing import reach_table
 from vprism_plan.collision.reports import StateReport
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays

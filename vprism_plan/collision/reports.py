@@ -9,29 +9,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-Kind = Literal[
-    "object", "support", "background", "occluded", "unobserved", "known",
-    "risk", "self", "joint_limit", "not_finite",
-]  # fmt: skip
+from vprism_plan.world.sources import SourceKind, spoken
+
+Kind = SourceKind | Literal["risk", "self", "joint_limit", "not_finite"]
 
 Point = tuple[float, float, float]
 
-# How a reason names what is no thing.
-SPOKEN = {
-    "background": "unlabelled clutter",
-    "occluded": "occluded space",
-    "support surface": "the support surface",
-    "unobserved": "unobserved space",
-}
 _ROBOT_LINK, _WORLD_OBJECT = 0, 1  # moveit_msgs/ContactInformation body types
-
-
-def kind_of(name: str) -> Kind:
-    """Return what the name of a source stands for."""
-    if name == "support surface":
-        return "support"
-    lead: Any = name.split(":", 1)[0]
-    return lead if lead in {"object", "background", "occluded", "unobserved"} else "known"
 
 
 def as_point(values: Float[np.ndarray, "3"]) -> Point:
@@ -86,7 +70,7 @@ class Contact:
         at = "" if not self.position else " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
         sure = "" if self.probability is None else f", P(occupied) {self.probability:.2f}"
         why = f" ({self.detail})" if self.detail else ""
-        body = SPOKEN.get(self.body, self.body)
+        body = spoken(self.body)
         way = f"{1000 * abs(self.required - self.depth):.1f}"
         if way == "0.0":
             return f"{self.link} touches {body}{at}{sure}{why}"

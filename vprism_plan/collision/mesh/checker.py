@@ -16,22 +16,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vprism_plan._arguments import number
 from vprism_plan.collision import explain
 from vprism_plan.collision.config import CheckerConfig, contact_rules
-from vprism_plan.collision.inputs import Numbers, configuration, configurations
 from vprism_plan.collision.mesh.comparison import PathFinding, PathOpinion, causes_between
 from vprism_plan.collision.mesh.fcl import fcl
 from vprism_plan.collision.mesh.queries import Queries
-from vprism_plan.collision.mesh.solids import LinkShapes, PlacedSolids, robot_solids
-from vprism_plan.collision.mesh.world import MeshWorld
-from vprism_plan.collision.reports import Contact, MotionReport, StateReport
+from vprism_plan.collision.mesh.solids import (
+    LinkShapes,
+    MeshWorld,
+    PlacedSolids,
+    robot_solids,
+)
+from vprism_plan.collision.packing import Numbers, configuration, configurations
+from vprism_plan.collision.reports import Contact, MotionReport
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import Robot
 
 _MAX_CONFIGURATIONS = 1_000_000
 
 
-class MeshChecker:
+class MeshChecker(explain.Checker):
     """Checks a robot's solids against extracted meshes, half-spaces and known geometry.
 
     What it judges: every object's surface {P(occupied) >= level} as a closed mesh, the
@@ -89,15 +94,11 @@ class MeshChecker:
         seen: bool = True,
     ) -> None:
         fcl()
-        if not (math.isfinite(step) and step >= 1e-5):
-            raise ConfigError(f"step is {step!r}; it must be finite and at least 1e-5 metres")
-        made: dict[str, Any] = {
-            "links": links,
-            "link_meshes": link_meshes,
-            "resolution": resolution,
-        }
-        made |= {"step": step, "seen": seen}
-        self._made: Callable[[], MeshChecker] = partial(MeshChecker, world, robot, config, **made)
+        number("step", step, 1e-5, unit="metres")
+        self._made: Callable[[], MeshChecker] = partial(
+            MeshChecker, world, robot, config, links=links, link_meshes=link_meshes,
+            resolution=resolution, step=step, seen=seen,
+        )  # fmt: skip
         if hasattr(world, "for_base"):
             world = world.for_base(robot.base_pose[:3, 3])
         self.world = world
@@ -146,36 +147,18 @@ class MeshChecker:
         table = np.array([[False, *(i in rule for i in object_ids)] for rule in rules])
         return np.asarray(table[index])
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is usable but odd about the world and the robot; every verdict carries it."""
-        return explain.warnings_of(self.world, self.robot)
-
     # --- configurations ----------------------------------------------------------
 
-    def is_valid(self, q: Numbers) -> bool:
-        """Return whether every solid keeps its distances, within joint limits.
-
-        Returns:
-            False also for a configuration that is not finite.
-
-        Raises:
-            RobotError: q does not have shape (dof,).
-        """
-        return self.is_valid_buffer(configuration(self.robot, q))
-
     def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
-        """`is_valid` without looking at the shape."""
+        """`is_valid` without looking at the shape: every solid keeps its distances."""
         if explain.limit_contacts(self.robot, q):
             return False
         self.placed.place(q)
         return not self._queries.collides()
 
     def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
-        """Return `is_valid` for each row of Q (n, dof)."""
-        return np.array(
-            [self.is_valid_buffer(q) for q in configurations(self.robot, Q)], dtype=bool
-        )
+        """Return `is_valid` for each row of Q."""
+        return np.array([*map(self.is_valid_buffer, configurations(self.robot, Q))], dtype=bool)
 
     def clearance(self, q: Numbers) -> float:
         """Return the distance from the moving links to the nearest surface, metres.
@@ -188,19 +171,14 @@ class MeshChecker:
         that a link is in it is known (0). In touch it is what FCL can say: exact depth for
         half-spaces, for spheres against anything, and between primitives; 0 for a box,
         cylinder or mesh that crosses a mesh's surface (FCL has no depth for that); minus the
-        gap to the surface for one wholly inside.
-
-        Raises:
-            RobotError: q does not have shape (dof,) or is not finite.
+        gap to the surface for one wholly inside. RobotError if q is not finite.
         """
         self.placed.place(self.robot.check_configuration(q))
         return self._queries.clearance()
 
     def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
-        """Return `clearance` for each row of Q (n, dof), metres."""
-        return np.array(
-            [self.clearance(q) for q in configurations(self.robot, Q)], dtype=np.float64
-        )
+        """Return `clearance` for each row of Q, metres."""
+        return np.array([*map(self.clearance, configurations(self.robot, Q))], dtype=np.float64)
 
     def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
@@ -209,16 +187,6 @@ class MeshChecker:
             self.placed.place(q)
             found.append(self._queries.self_clearance())
         return np.array(found, dtype=np.float64)
-
-    def explain(self, q: Numbers) -> StateReport:
-        """Return the verdict on a configuration with every reason that refuses it.
-
-        Raises:
-            RobotError: q does not have shape (dof,).
-        """
-        q = configuration(self.robot, q)
-        centers = self.robot.sphere_centers
-        return explain.report(self, q, self.contacts, self._permitted, centers)
 
     def contacts(self, q: Numbers) -> tuple[Contact, ...]:
         """Return every reason to refuse q: the deepest contact of each link and body.
@@ -229,9 +197,6 @@ class MeshChecker:
 
         Returns:
             Deepest first; empty exactly if `is_valid(q)`. `sphere` is -1 for solids.
-
-        Raises:
-            RobotError: q does not have shape (dof,).
         """
         q = configuration(self.robot, q)
         reasons = explain.limit_contacts(self.robot, q)
@@ -244,13 +209,10 @@ class MeshChecker:
         """Return the distance from one link to one body, metres, as `clearance` states it.
 
         Args:
-            q: (dof,) configuration.
-            link: one of `robot.link_names`.
+            q: configuration.
+            link: one of `robot.link_names`, or RobotError.
             body: "object:3", "known:NAME", a half-space, or another link; inf for what
                 has no surface here ("occluded", an object left out of the meshes, ...).
-
-        Raises:
-            RobotError: the configuration or the link is not one of the robot's.
         """
         self.placed.place(self.robot.check_configuration(q))
         if link not in self.robot.link_names:
@@ -263,24 +225,15 @@ class MeshChecker:
 
     # --- motions -----------------------------------------------------------------
 
-    def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
-        """Return whether the straight edge from qa to qb is free at discrete configurations.
-
-        Between two of them no point of the robot moves more than `step` metres. (FCL's
-        continuous check crashes or misses with meshes, and is not used.) The edge means what
-        its ends say, as for `CollisionChecker`.
-
-        Raises:
-            RobotError: an end does not have shape (dof,).
-            ConfigError: the step asks for too many configurations.
-        """
-        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
-        return self.check_motion_buffer(qa, qb)
-
     def check_motion_buffer(
         self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
     ) -> bool:
-        """`check_motion` without looking at shapes."""
+        """`check_motion` without looking at shapes, at discrete configurations.
+
+        Between two of them no point of the robot moves more than `step` metres. (FCL's
+        continuous check crashes or misses with meshes, and is not used.) ConfigError if that
+        asks for too many.
+        """
         return all(self.is_valid_buffer(q) for _, q in self._between(qa, qb))
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
@@ -330,10 +283,6 @@ class MeshChecker:
 
     def review(self, checker: Any, path: Numbers) -> PathOpinion:
         """Check a path that another checker accepted, and say why the two disagree.
-
-        Args:
-            checker: the `CollisionChecker` that accepted it.
-            path: (T, dof) waypoints.
 
         Returns:
             `check_path`, with the causes of each disagreement as `compare` names them;

@@ -4,36 +4,28 @@
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.collision.inputs import Numbers, configurations
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import SEEN
+from vprism_plan.collision.packing import Numbers, configurations
 from vprism_plan.collision.reports import Contact
+from vprism_plan.world.sources import SOURCES, object_id, source_of
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
 # Grid steps that the field may refuse beyond a surface: its interpolation gives up less than
 # one (half a cell's diagonal), its cover less than half.
 _INFLATION = 1.5
-CauseKind = Literal[
-    "conservative spheres", "margin", "voxel inflation", "occluded", "unobserved", "background",
-    "thin seen part", "too small for the mesh",
-    "solids outside spheres", "coarse mesh", "rounding", "edge tolerance", "missed by the field",
-    "seen by a camera",
-    "contact rules", "posterior risk", "unexplained",
-]  # fmt: skip
-
-_WHY: dict[CauseKind, str] = {
+# Kinds of causes, and what they mean.
+_WHY: dict[str, str] = {
     # the field refuses, meshes accept
     "conservative spheres": "the link's spheres reach it, its solids do not",
     "margin": "nothing touches, but the field's checker keeps a margin",
     "voxel inflation": "the field's cells reach beyond the surface",
-    "occluded": "no camera saw it, and meshes touch nothing that they ask about",
-    "unobserved": "no camera looked there, and meshes touch nothing that they ask about",
-    "background": "its cells reach farther than the points of the unlabelled clutter",
+    **{name: source.beyond for name, source in SOURCES.items() if source.beyond},
     "thin seen part": "its cells reach farther than the points of a part that the map smooths away",
     "too small for the mesh": "the object has no surface on the mesh's lattice",
     # meshes refuse, the field accepts
@@ -63,7 +55,7 @@ class Cause:
             the spheres do ("margin", "voxel inflation"), or the depth of the contact.
     """
 
-    kind: CauseKind
+    kind: str
     link: str
     body: str
     amount: float
@@ -237,9 +229,8 @@ def causes_between(
 
 
 def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
-    kind: Any
     amount = contact.depth
-    if contact.body in {"occluded", "unobserved", "background"}:
+    if contact.body in SOURCES and SOURCES[contact.body].beyond:
         kind = contact.body
     elif contact.kind == "risk":
         kind = "posterior risk"
@@ -260,7 +251,7 @@ def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, 
 
 def _of_surface(
     checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]
-) -> tuple[CauseKind, float]:
+) -> tuple[str, float]:
     """Cause and amount where the field refuses a sphere for an object or known geometry."""
     margin = float(checker.config.margin)
     center = meshes.robot.sphere_centers(q)[contact.sphere]
@@ -286,7 +277,7 @@ def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named:
     For an object: to any of them, since the field names the nearest to a grid node.
     """
     surfaces = meshes.surfaces
-    objects = named.startswith("object:")
+    objects = object_id(named) is not None
     inside = objects and surfaces.object_at(center[None])[0] > 0
     best = math.inf
     for body in surfaces.bodies:
@@ -316,7 +307,7 @@ def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: flo
 
 
 def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
-    kind: CauseKind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
+    kind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
         kind = "unexplained"  # a joint limit: both know the same
@@ -324,7 +315,7 @@ def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "
         kind = "contact rules"
     elif contact.kind == "object" and contact.detail != SEEN and _draws_judge(checker):
         kind = "posterior risk"
-    elif contact.depth <= _TOLERANCE and contact.kind not in ("occluded", "unobserved"):
+    elif contact.depth <= _TOLERANCE and not source_of(contact.body).policy:
         kind = "rounding"
     elif contact.sphere < 0 and not _in_spheres(meshes, q, links, contact):
         kind = "solids outside spheres"
@@ -349,9 +340,8 @@ def _in_level_set(checker: Any, contact: Contact) -> bool:
 
 def _field_allows(checker: Any, contact: Contact) -> bool:
     """Whether the field's checker lets the link touch the object."""
-    object_id = int(contact.body.split(":", 1)[1])
     return any(
-        object_id in ids and contact.link in checker.robot.links_of(name)
+        object_id(contact.body) in ids and contact.link in checker.robot.links_of(name)
         for name, ids in checker.config.allowed_contacts.items()
     )
 

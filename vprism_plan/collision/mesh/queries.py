@@ -10,15 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.explain import Touch, contact, deepest, policy_detail
+from vprism_plan.collision.explain import UP, Touch, contact, deepest
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import HiddenSpace, SeenPoints
-from vprism_plan.collision.mesh.solids import PlacedSolids
-from vprism_plan.collision.mesh.world import MeshWorld
-from vprism_plan.collision.reports import Contact, kind_of
-from vprism_plan.world.visibility import OCCLUDED
-
-_UP = np.array([0.0, 0.0, 1.0])
+from vprism_plan.collision.mesh.solids import MeshWorld, PlacedSolids
+from vprism_plan.collision.reports import Contact
+from vprism_plan.world.sources import source_of
+from vprism_plan.world.visibility import UNSEEN
 
 
 class Queries:
@@ -198,7 +196,7 @@ class Queries:
         if self._hidden is None:
             return
         for i, point, code in zip(*self._hidden.find(margin), strict=True):
-            yield int(i), "occluded" if code == OCCLUDED else "unobserved", point
+            yield int(i), UNSEEN[int(code)], point
 
     def _link_gap(self, i: int, j: int) -> float:
         """Distance between two solids of the robot; 0 where a mesh is touched."""
@@ -250,7 +248,7 @@ class Queries:
             name = f"object:{self.world.map.object_ids[int(owner[i]) - 1]}"
             boxed = [b for b, body in enumerate(self.surfaces.bodies) if body.name == name]
             if not near[i, boxed].any():
-                yield self._contact(i, name, (0.0, self.placed.witnesses[i], _UP), self._need[i])
+                yield self._contact(i, name, (0.0, self.placed.witnesses[i], UP), self._need[i])
 
     def _touch(self, i: int, b: int, inside: bool) -> Touch:
         """How near solid i and body b are, or how deep in each other."""
@@ -263,12 +261,12 @@ class Queries:
         if body.shape.hollow and (shape.kind == "sphere" or inside):
             way, point = fcl.point_distance(body.shape, start)
             out = point - start if inside else start - point
-            normal = out / way if way > 1e-9 else _UP
+            normal = out / way if way > 1e-9 else UP
             if shape.kind == "sphere":
                 return (-way if inside else way) - shape.size[0], point, normal
             return -fcl.gap(body.shape, shape), start, normal
         if self._holds(i, body.witnesses):  # a body inside a link's mesh
-            return 0.0, body.witnesses[0], _UP
+            return 0.0, body.witnesses[0], UP
         return _apart(body.shape, shape)
 
     def _point_contacts(self) -> Iterator[Contact]:
@@ -281,7 +279,7 @@ class Queries:
                 place = points.points[row]
                 out = self.placed.centers[i] - place
                 length = float(np.linalg.norm(out))
-                normal = out / length if length > 1e-9 else _UP
+                normal = out / length if length > 1e-9 else UP
                 name, detail = points.bodies[body]
                 yield self._contact(i, name, (gap, place, normal), need, detail)
 
@@ -289,8 +287,8 @@ class Queries:
         """Samples in hidden space, or as near to it as the margin: how near is not known."""
         for margin in (0.0, self._margin) if self._margin > 0.0 else (0.0,):
             for i, body, place in self._unseen(margin):
-                detail = policy_detail(self.world.config, kind_of(body))
-                yield self._contact(i, body, (margin, place, _UP), self._need[i], detail)
+                detail = source_of(body).reason(self.world.config)
+                yield self._contact(i, body, (margin, place, UP), self._need[i], detail)
 
     def _self_contacts(self) -> Iterator[Contact]:
         for row in self._near_pairs():
@@ -302,7 +300,7 @@ class Queries:
             touch: Touch | None = fcl.deepest_touch(a, b)
             if touch is None:
                 near = fcl.gap(a, b) <= self._self_margin
-                touch = _apart(a, b) if near else (0.0, self.placed.witnesses[i], _UP)
+                touch = _apart(a, b) if near else (0.0, self.placed.witnesses[i], UP)
             other = self.placed.robot.link_names[self.solids[j].link]
             yield self._contact(i, other, touch, self._self_margin)
 
@@ -310,9 +308,9 @@ class Queries:
         self, i: int, body: str, touch: Touch, required: float, detail: str = ""
     ) -> Contact:
         solid, names = self.solids[i], self.placed.robot.link_names
-        kind = "self" if body in names else kind_of(body)
+        kind = "self" if body in names else source_of(body).kind
         sure = None
-        if kind not in {"self", "known", "support"}:
+        if kind != "self" and source_of(body).judged:
             sure = float(np.asarray(self.world.map.occupancy(touch[1][None]))[0])
         name, sphere = names[solid.link], solid.sphere
         return contact(kind, name, body, touch, float(required), sphere, sure, detail)
@@ -328,4 +326,4 @@ def _apart(a: fcl.Shape, b: fcl.Shape) -> Touch:
     second."""
     on_a, on_b = fcl.nearest_points(a, b)
     gap = fcl.gap(a, b)
-    return gap, on_a, (on_b - on_a) / gap if gap > 1e-9 else _UP
+    return gap, on_a, (on_b - on_a) / gap if gap > 1e-9 else UP
