@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from vprism_plan._arguments import number
 from vprism_plan._kernels import checking as kernels
@@ -15,6 +15,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.collision import entropy, explain, margins, motion
 from vprism_plan.collision.config import CheckerConfig, contact_rules
 from vprism_plan.collision.packing import (
+    Configuration,
     Numbers,
     PackedWorld,
     configuration,
@@ -26,6 +27,7 @@ from vprism_plan.collision.packing import (
 from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate
 from vprism_plan.collision.risk import PathRisk, Setting
 from vprism_plan.errors import ConfigError
+from vprism_plan.world.grid import Chosen, Values
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
@@ -114,12 +116,12 @@ class CollisionChecker(explain.Checker):
         self.sphere_clearances(q)
         self.pair_gaps(q)
 
-    def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
+    def is_valid_buffer(self, q: Configuration) -> bool:
         """`is_valid` for planners' inner loops: q must be a contiguous float64 (dof,) array."""
         free = kernels.is_valid(q, self._rf, self._ri, *self._world)
         return free and (self._bounded is None or self._bounded.accepts_one(q))
 
-    def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
+    def is_valid_batch(self, Q: Numbers) -> Chosen:
         """Return `is_valid` for each row of Q; runs on all worker threads."""
         Q = configurations(self.robot, Q)
         out = np.empty(len(Q), dtype=np.bool_)
@@ -144,17 +146,15 @@ class CollisionChecker(explain.Checker):
         """
         return float(self._clearances(configuration(self.robot, q)[None])[0][0])
 
-    def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+    def clearance_batch(self, Q: Numbers) -> Values:
         """Return `clearance` for each row of Q, metres."""
         return self._clearances(Q)[0]
 
-    def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+    def self_clearance_batch(self, Q: Numbers) -> Values:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
         return self._clearances(Q)[1]
 
-    def check_motion_buffer(
-        self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
-    ) -> bool:
+    def check_motion_buffer(self, qa: Configuration, qb: Configuration) -> bool:
         """`check_motion` for contiguous float64 (dof,) arrays, without looking at shapes.
 
         Covered by conservative advancement on the clearances, with every link's displacement
@@ -192,13 +192,10 @@ class CollisionChecker(explain.Checker):
     def tightened(self, level: int) -> "CollisionChecker | None":
         """Return a checker with a stricter bound on risk; None if there is no stricter one.
 
-        Each edge of a path may be within `max_risk` and the path still above it. Level by
-        level fewer worlds may collide with an edge, then none, then the spheres grow by up
-        to two voxels. Everything is shared with this checker, whose verdicts include those
-        of the stricter one.
-
-        Raises:
-            ConfigError: this checker has no `max_risk`.
+        Each edge of a path may be within `max_risk` and the path still above it. Level by level
+        fewer worlds may collide with an edge, then none, then the spheres grow by up to two
+        voxels. Everything is shared with this checker, whose verdicts include those of the
+        stricter one. ConfigError without a `max_risk`.
         """
         if self._bounded is None:
             raise ConfigError("max_risk is None; only a bound on risk can be tightened")
@@ -211,7 +208,7 @@ class CollisionChecker(explain.Checker):
         return stricter
 
     def with_extra_margin(self, extra: float) -> "CollisionChecker":
-        """Return the same checker with `extra` metres (at least 0) more margin."""
+        """Return the same checker with `extra` metres more margin."""
         number("extra", extra, 0.0, unit="metres: a margin can only be widened")
         config = replace(self.config, margin=self.config.margin + extra)
         wider = CollisionChecker(self.world, self.robot, config)
@@ -229,10 +226,10 @@ class CollisionChecker(explain.Checker):
         found += explain.limit_contacts(self.robot, q)
         return (*explain.by_depth(found), *self._risk_contacts(q))
 
-    def _permitted(self, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+    def _permitted(self, q: Configuration) -> list[Contact]:
         return explain.allowed_contacts(self, q)
 
-    def _centers(self, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
+    def _centers(self, q: Configuration) -> Float[np.ndarray, "s 3"]:
         return self.sphere_clearances(q)[0]
 
     def verdict_field(self, link: int) -> Any:
@@ -244,21 +241,17 @@ class CollisionChecker(explain.Checker):
         return self._rules[int(self._link_rules[link])]
 
     def sphere_clearances(
-        self, q: Float[np.ndarray, "dof"]
+        self, q: Configuration
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return each sphere's centre (S, 3) in the world, and what is near it.
-
-        Returns:
-            Centres; distance to the nearest half-space and its index in
-            `world.planes`; lower bound of the distance to the baked obstacles. Metres.
-        """
+        """Return each sphere's centre (S, 3) in the world; the distance to the nearest half-space
+        and its index in `world.planes`; a lower bound of that to the baked obstacles. Metres."""
         n = int(self._ri[1])
         centers, plane, field = np.empty((3, n)), np.empty(n), np.empty(n)
         which = np.empty(n, dtype=np.int64)
         kernels.sphere_clearances(q, self._rf, self._ri, *self._world, centers, plane, which, field)
         return np.ascontiguousarray(centers.T), plane, which, field
 
-    def pair_gaps(self, q: Float[np.ndarray, "dof"]) -> tuple[np.ndarray, np.ndarray]:
+    def pair_gaps(self, q: Configuration) -> tuple[np.ndarray, np.ndarray]:
         """Return the gap of each of `robot.collision_pairs`, metres, and the spheres (P, 2)."""
         n = int(self._ri[3])
         gaps, spheres = np.empty(n), np.zeros((n, 2), dtype=np.int64)
@@ -311,8 +304,7 @@ class CollisionChecker(explain.Checker):
                 checked with, so their verdict on it is too mild.
 
         Raises:
-            RobotError: a wrong shape, a value that is not finite, or a prismatic joint
-                outside its limits (no bound on the motion holds there).
+            RobotError: see `packing.waypoints`.
         """
         rows = waypoints(self.robot, path, single=True)
         risk = self._risk()
@@ -338,7 +330,7 @@ class CollisionChecker(explain.Checker):
         """Return what probabilities are counted with, for planners' objectives."""
         return self._risk().setting
 
-    def _risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
+    def _risk_contacts(self, q: Configuration) -> tuple[Contact, ...]:
         bounded = self._bounded
         if bounded is None or bounded.accepts_one(q):
             return ()

@@ -1,30 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What "free" means for one checker."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
-from vprism_plan._arguments import is_number, is_whole
+from vprism_plan._arguments import is_whole, number, whole
 from vprism_plan.errors import ConfigError
-
-# What each number must be, in words and as a test that nan fails.
-_LENGTH = "finite and at least 0 metres", lambda v: 0.0 <= v < np.inf
-_NUMBERS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "margin": _LENGTH,
-    "self_margin": _LENGTH,
-    "min_motion": ("finite and at least 1e-5 metres", lambda v: 1e-5 <= v < np.inf),
-    "max_risk": (
-        "a probability strictly between 0 and 1, or None for no bound",
-        lambda v: 0.0 < v < 1.0,
-    ),
-    "n_worlds": ("a positive multiple of 64", lambda v: v >= 64 and v % 64 == 0),
-    "risk_seed": ("at least 0", lambda v: v >= 0),
-    "confidence": ("strictly between 0 and 1", lambda v: 0.0 < v < 1.0),
-}
 
 
 @dataclass(frozen=True)
@@ -65,17 +50,16 @@ class CheckerConfig:
 
     def __post_init__(self) -> None:
         """Refuse values that would make a verdict meaningless."""
-        for name, (wanted, fits) in _NUMBERS.items():
-            value = getattr(self, name)
-            if name == "max_risk" and value is None:
-                continue
-            whole = name in {"n_worlds", "risk_seed"}
-            if not (is_whole(value) if whole else is_number(value)):
-                raise ConfigError(
-                    f"{name} is {value!r}; it must be a {'whole ' if whole else ''}number"
-                )
-            if not fits(value):
-                raise ConfigError(f"{name} is {value!r}; it must be {wanted}")
+        number("margin", self.margin, 0.0, unit="metres")
+        number("self_margin", self.self_margin, 0.0, unit="metres")
+        number("min_motion", self.min_motion, 1e-5, unit="metres")
+        if self.max_risk is not None:
+            unit = "(a probability; None for no bound)"
+            number("max_risk", self.max_risk, 0.0, 1.0, unit, above=True, below=True)
+        if whole("n_worlds", self.n_worlds, 64) % 64:
+            raise ConfigError(f"n_worlds is {self.n_worlds}; it must be a multiple of 64")
+        whole("risk_seed", self.risk_seed)
+        number("confidence", self.confidence, 0.0, 1.0, above=True, below=True)
         object.__setattr__(self, "allowed_contacts", _checked_contacts(self.allowed_contacts))
 
     @property
@@ -106,13 +90,8 @@ def _checked_contacts(contacts: Any) -> dict[str, frozenset[int]]:
 def contact_rules(
     robot: Any, allowed: Mapping[str, Collection[int]]
 ) -> tuple[list[frozenset[int]], Int[np.ndarray, " links"]]:
-    """Turn allowed contacts into distinct rules.
-
-    Args:
-        robot: whose links and groups are named: has `link_names`, and `links_of(name)` as
-            `vprism_plan.robots.Robot` does.
-        allowed: link or SRDF group -> ids of the objects it may touch; what several
-            entries say of one link adds up.
+    """Turn allowed contacts (see `CheckerConfig`; what several entries say of one link adds up)
+    into distinct rules.
 
     Returns:
         The sets of objects that may be touched, the empty one first, and the index of the
@@ -128,8 +107,8 @@ def contact_rules(
             per_link[names.index(link)].update(int(i) for i in ids)
     rules = [frozenset[int]()]
     index = np.zeros(len(names), dtype=np.int64)
-    for number, own in enumerate(map(frozenset, per_link)):
+    for link, own in enumerate(map(frozenset, per_link)):
         if own not in rules:
             rules.append(own)
-        index[number] = rules.index(own)
+        index[link] = rules.index(own)
     return rules, index

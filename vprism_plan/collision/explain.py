@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What every checker answers, and why it refuses: named reasons, not on the fast path."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any
 
@@ -9,21 +8,21 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._kernels.checking import FARTHEST
-from vprism_plan.collision.packing import Numbers, configuration
+from vprism_plan.collision.packing import Configuration, Numbers, configuration
 from vprism_plan.collision.reports import Contact, Kind, StateReport, as_point
-from vprism_plan.world.grid import window
+from vprism_plan.world.grid import Balls, Points, Vector, window
 from vprism_plan.world.sources import policies, source_of
 from vprism_plan.world.visibility import UNSEEN, free_balls
 
 # Signed distance, metres; where, world; unit direction that leads out.
-Touch = tuple[Any, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+Touch = tuple[Any, Vector, Vector]
 
 UP = np.array([0.0, 0.0, 1.0])  # out of what says nothing of the way out
 _SAMPLES = 96
 _AROUND = 2  # nodes beyond a point's cell that are asked for the nearest obstacle's name
 
 
-def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
+def unit_ball_points(n: int = _SAMPLES) -> Points:
     """Return n points spread evenly through the unit ball, its surface included."""
     i = np.arange(n) + 0.5
     polar = np.arccos(1.0 - 2.0 * i / n)
@@ -37,67 +36,29 @@ def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
     return directions * radius[:, None]
 
 
-class Checker(ABC):
-    """Answers about a robot in a world.
+class Checker:
+    """What checkers answer alike; see there for `is_valid_buffer` and `check_motion_buffer` (the
+    same for contiguous float64 arrays, whatever their shape), `clearance` and `contacts`.
 
     A configuration is (dof,) joint values, radians or metres, in the order of
     `robot.joint_names`, a batch (n, dof); what has another shape raises RobotError.
     """
 
-    world: Any
-    robot: Any
-    config: Any
-
-    @abstractmethod
-    def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
-        """`is_valid` without looking at the shape: q must be a contiguous float64 array."""
-
-    @abstractmethod
-    def check_motion_buffer(
-        self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
-    ) -> bool:
-        """`check_motion` likewise."""
-
-    @abstractmethod
-    def clearance(self, q: Numbers) -> float:
-        """Return how far the robot is from the world, metres."""
-
-    @abstractmethod
-    def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
-        """Return the smallest gap between links that may collide, for each row of Q, metres."""
-
-    @abstractmethod
-    def contacts(self, q: Numbers) -> tuple[Contact, ...]:
-        """Return every reason to refuse a configuration, the deepest first."""
-
-    @abstractmethod
-    def _permitted(self, q: Float[np.ndarray, "dof"]) -> Iterable[Contact]:
-        """Contacts that the rules permit."""
-
-    def is_valid(self, q: Numbers) -> bool:
-        """Return whether a configuration is free.
-
-        False also for one that is not finite; ask `explain` why.
-        """
+    def is_valid(self: Any, q: Numbers) -> bool:
+        """Return whether a configuration is free; one that is not finite is not."""
         return self.is_valid_buffer(configuration(self.robot, q))
 
-    def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
-        """Return whether the straight edge from qa to qb is free, ends included.
-
-        The edge is straight in joint space and means what its ends say: a continuous joint
-        turns by their difference, however often round.
-        """
+    def check_motion(self: Any, qa: Numbers, qb: Numbers) -> bool:
+        """Return whether the edge from qa to qb, straight in joint space, is free, ends included.
+        A continuous joint turns by their difference, however often round."""
         qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
         return self.check_motion_buffer(qa, qb)
 
-    def explain(self, q: Numbers) -> StateReport:
+    def explain(self: Any, q: Numbers) -> StateReport:
         """Return the verdict on a configuration with every reason that refuses it."""
         q = configuration(self.robot, q)
         margin = self.config.margin
-        told: dict[str, Any] = {
-            "policies": policies(self.world.config),
-            "warnings": self.warnings,
-        }
+        told: dict[str, Any] = {"policies": policies(self.world.config), "warnings": self.warnings}
         if not np.isfinite(q).all():
             limits = tuple(limit_contacts(self.robot, q))
             return StateReport(False, limits, np.nan, np.nan, margin, **told)
@@ -113,12 +74,12 @@ class Checker(ABC):
             **told,
         )
 
-    def _centers(self, q: Float[np.ndarray, "dof"]) -> Float[np.ndarray, "s 3"]:
+    def _centers(self: Any, q: Configuration) -> Float[np.ndarray, "s 3"]:
         """Centres of the robot's spheres, world, metres."""
         return np.asarray(self.robot.sphere_centers(q))
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def warnings(self: Any) -> tuple[str, ...]:
         """What is usable but odd about the world and the robot; every verdict carries it."""
         found = (*getattr(self.world, "warnings", ()), *getattr(self.robot, "warnings", ()))
         return tuple(dict.fromkeys(found))
@@ -142,7 +103,7 @@ def volume_shares(world: Any, robot: Any, centers: Float[np.ndarray, "s 3"]) -> 
     return {name: float(weight @ np.mean(status == k, axis=1)) for k, name in UNSEEN.items()}
 
 
-def limit_contacts(robot: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def limit_contacts(robot: Any, q: Configuration) -> list[Contact]:
     """Return the joints that are not finite, absurdly far, or outside their limits."""
     found = []
     for j, name in enumerate(robot.joint_names):
@@ -168,7 +129,7 @@ def limit_contacts(robot: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
     return found
 
 
-def world_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def world_contacts(checker: Any, q: Configuration) -> list[Contact]:
     """Return the deepest contact of each (link, body), from every sphere's own distances."""
     robot, world, margin = checker.robot, checker.world, checker.config.margin
     centers, plane, which, field = checker.sphere_clearances(q)
@@ -230,7 +191,7 @@ def deepest(contacts: Iterable[Contact]) -> list[Contact]:
 
 
 def _beside_pictured_robot(
-    sphere: Float[np.ndarray, "4"], robots: Float[np.ndarray, "s 4"], margin: float, world: Any
+    sphere: Float[np.ndarray, "4"], robots: Balls, margin: float, world: Any
 ) -> str:
     """The remedy for a sphere in the shadow of the robot as it was in a picture, or nothing."""
     away = np.linalg.norm(robots[:, :3] - sphere[:3], axis=1)
@@ -240,7 +201,7 @@ def _beside_pictured_robot(
     return f"; beside the pictured robot: ignore_self(..., room={room:g}) is your word for it"
 
 
-def allowed_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def allowed_contacts(checker: Any, q: Configuration) -> list[Contact]:
     """Return the deepest contact of each link with each object that it may touch."""
     robot, world = checker.robot, checker.world
     if not any(checker.allowed_objects(link) for link in range(len(robot.link_names))):
@@ -263,9 +224,7 @@ def allowed_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]
     return deepest(found)
 
 
-def nearest_source(
-    world: Any, field: Any, point: Float[np.ndarray, "3"]
-) -> tuple[str, Float[np.ndarray, "3"]]:
+def nearest_source(world: Any, field: Any, point: Vector) -> tuple[str, Vector]:
     """Return the name of the obstacle nearest to a point and the direction away from it.
 
     A node at the distance d from an obstacle says that it is at most d plus the way to the
@@ -301,7 +260,7 @@ def nearest_source(
     return name, normal
 
 
-def self_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def self_contacts(checker: Any, q: Configuration) -> list[Contact]:
     """Return the link pairs that come too near to each other."""
     robot, margin = checker.robot, checker.config.self_margin
     gaps, spheres = checker.pair_gaps(q)

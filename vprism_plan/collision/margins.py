@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan.collision.motion import edges_of, joint_units, place_points, sphere_jacobians
-from vprism_plan.collision.packing import Numbers, checked_tolerance, configurations
+from vprism_plan.collision.packing import Numbers, Rows, checked_tolerance, configurations
 from vprism_plan.collision.reports import Kind
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses, joint_values
 from vprism_plan.world.distance import DistanceField
+from vprism_plan.world.grid import Points, Values
 from vprism_plan.world.sources import object_id, source_of, spoken
 
 _CHUNK = 512  # configurations whose spheres are in memory at once
@@ -27,8 +28,8 @@ class BodyMargin:
         link: the link.
         body: the obstacle, named as in `Contact.body`.
         kind: what it is.
-        clearance: lower bound of the distance between them, metres; negative inside.
-            Along a path: over all of it, edges included.
+        clearance: lower bound of the distance between them (over all of a path), metres;
+            negative inside.
         gradient: (dof,) change of the distance per radian or metre of each joint, at the
             configuration where they are nearest, from the slope of the distance field;
             zeros where that has none (in the middle of an obstacle).
@@ -147,29 +148,21 @@ class SafetyMargins:
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """One obstacle.
-
-    Attributes:
-        name: as in `World.sources` and `World.plane_names`.
-        kind: what it is.
-        plane: (4,) normal and offset of a half-space, else None.
-        field: distances to everything else, else None.
-    """
+    """One of `World.sources` or `World.plane_names`: a half-space with its normal and offset
+    (4,), or what has a field of distances."""
 
     name: str
     kind: Kind
     plane: Any = None
     field: DistanceField | None = None
 
-    def bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def bound(self, points: Points) -> Values:
         """Lower bound of the signed distance from points (world, metres); exact for planes."""
         if self.field is None:
             return np.asarray(points @ self.plane[:3] - self.plane[3])
         return self.field.lower_bound(points)
 
-    def nearest(
-        self, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    def nearest(self, points: Points) -> tuple[Points, Points]:
         """Nearest points of the obstacle (of what is not the obstacle, from inside it), and
         the unit directions in which the distance grows (0 where it has no slope).
 
@@ -192,14 +185,9 @@ class Obstacle:
         return found, normal
 
 
-def _slope(
-    field: DistanceField, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Interpolated distance and its unit slope, from differences over one voxel.
-
-    Over a voxel, because the slope of a trilinear interpolation itself is constant along
-    each axis of a cell: off a ball it errs by three degrees, these by less than one.
-    """
+def _slope(field: DistanceField, points: Points) -> tuple[Values, Points]:
+    """Interpolated distance and its unit slope, from differences over one voxel: the slope of a
+    trilinear interpolation errs by three degrees off a ball, these by less than one."""
     import torch
 
     half = 0.5 * field.spacing
@@ -249,8 +237,7 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
         tolerance: see above, metres; for a path only.
 
     Raises:
-        RobotError: the shape is wrong, a value is not finite, or the path is too long
-            for the tolerance.
+        RobotError: see `waypoints`; or the path is too long for the tolerance.
     """
     checked_tolerance(tolerance)
     array = joint_values(q_or_path, checker.robot, "a path")
@@ -276,22 +263,15 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
 
 def margin_profile(
     checker: Any, path: Numbers, tolerance: float = 0.005
-) -> tuple[Float[np.ndarray, " n"], dict[str, Float[np.ndarray, " n"]]]:
-    """Return the clearance of the whole robot to each obstacle along a path, metres.
+) -> tuple[Values, dict[str, Values]]:
+    """Return the clearance of the whole robot to each obstacle along a path (T, dof), metres.
 
-    Contacts that a rule allows do not count.
-
-    Args:
-        checker: a `CollisionChecker` over a `World`.
-        path: (T, dof) waypoints.
-        tolerance: no sphere moves more than this, metres, to the nearest sample.
+    Contacts that a rule allows do not count. Errors as for `safety_margin`.
 
     Returns:
-        Places on the path (number of the edge plus the fraction of it), and for each
-        obstacle the clearance there; at the samples, nothing subtracted.
-
-    Raises:
-        RobotError: see `safety_margin`.
+        Places on the path (number of the edge plus the fraction of it), so close that no sphere
+        moves more than the tolerance (metres) to the nearest, and for each obstacle the
+        clearance there, nothing subtracted.
     """
     checked_tolerance(tolerance)
     Q, places = edges_of(checker, path).samples(tolerance)
@@ -319,16 +299,10 @@ def _is_allowed(body: Obstacle, rule: frozenset[int]) -> bool:
 
 
 def _scan(
-    checker: Any,
-    Q: Float[np.ndarray, "n dof"],
-    bodies: Sequence[Obstacle],
-    links: Int[np.ndarray, " l"],
+    checker: Any, Q: Rows, bodies: Sequence[Obstacle], links: Int[np.ndarray, " l"]
 ) -> Iterator[tuple[slice, int, Float[np.ndarray, "m l"], Int[np.ndarray, "m l"]]]:
-    """Yield, per piece of Q and number of a body, each link's bound and the sphere that has it.
-
-    As in the checker, a link's bound is the larger of that of its nearest sphere and
-    that of the ball around all its spheres.
-    """
+    """Yield, per piece of Q and number of a body, each link's bound and the sphere that has it:
+    the larger of that of its nearest sphere and that of the ball around all its spheres."""
     arrays = checker.robot.arrays
     spheres = [np.arange(arrays.link_start[k], arrays.link_start[k + 1]) for k in links]
     used = np.concatenate([*spheres, np.empty(0, dtype=np.int64)])
@@ -352,9 +326,7 @@ def _scan(
             yield rows, number, np.maximum(bound, whole - arrays.link_radius[links]), nearest
 
 
-def _nearest_pairs(
-    checker: Any, Q: Float[np.ndarray, "n dof"], places: Float[np.ndarray, " n"], slack: float
-) -> Iterator[BodyMargin]:
+def _nearest_pairs(checker: Any, Q: Rows, places: Values, slack: float) -> Iterator[BodyMargin]:
     for rule, links in _rules(checker):
         bodies = obstacles_of(checker.world, rule)
         shape = (len(bodies), len(links))

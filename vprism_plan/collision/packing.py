@@ -20,6 +20,12 @@ from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
 from vprism_plan.robots.kinematics import KIND_PRISMATIC, joint_values
+from vprism_plan.world.grid import Vector
+
+# Arrays of joint values: of one configuration, of many, of a path.
+Configuration = Float[np.ndarray, "dof"]
+Rows = Float[np.ndarray, "n dof"]
+Waypoints = Float[np.ndarray, "t dof"]
 
 _HEADER = 24
 AT_MOST = 200_000  # configurations that one query may ask about
@@ -39,7 +45,7 @@ class PackedRobot:
     ints: Int[np.ndarray, "i"]
 
 
-def _rotation_from_z(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def _rotation_from_z(axis: Vector) -> Float[np.ndarray, "3 3"]:
     """Return a rotation whose third column is the unit vector `axis`."""
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(helper, axis)
@@ -65,13 +71,9 @@ def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
 
 
 def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
-    """Bound the distance between each joint's axis and each link's sphere centres.
-
-    Entry (f, l) is an upper bound, over all configurations within the limits, on how
-    far joint f can move any sphere centre of link l per unit of its own motion
-    (metres per radian; 1 for prismatic joints); -1 where f does not move l. Offsets
-    along the chain are added up, which is the triangle inequality.
-    """
+    """Bound how far each joint can move any sphere centre of each link, over all configurations
+    within the limits, metres per unit of its own motion (1 for prismatic joints); -1 where it
+    does not move the link. Offsets along the chain are added up: the triangle inequality."""
     table = np.full((len(arrays.parent), len(arrays.link_frame)), -1.0)
     chains = ancestors(arrays.parent)
     for link, own in enumerate(arrays.link_frame):
@@ -116,16 +118,12 @@ def _frame_floats(arrays: KinematicArrays) -> tuple[np.ndarray, list[np.ndarray]
 def pack_robot(
     arrays: KinematicArrays, self_margin: float = 0.0, rules: Int[np.ndarray, "l"] | None = None
 ) -> PackedRobot:
-    """Pack a robot's kinematics, spheres and pairs for the kernels.
-
-    Args:
-        arrays: Flat description of the robot.
-        self_margin: Gap, metres, that link pairs must keep beyond touching.
-        rules: Which of the packed world's fields each link is checked against; None is
-            the first for all. Links that no joint moves are checked against none.
+    """Pack a robot for the kernels: its pairs keep `self_margin` (metres) beyond touching, and
+    `rules` say which of a packed world's fields each link is checked against (the first, if not
+    given). Links that no joint moves are checked against none.
 
     Raises:
-        RobotError: A prismatic joint has no finite limits, so its motion has no bound.
+        RobotError: a prismatic joint has no finite limits, so its motion has no bound.
     """
     for frame in np.flatnonzero(arrays.kind == KIND_PRISMATIC):
         if not np.isfinite(_prismatic_travel(arrays, int(frame))):
@@ -174,11 +172,8 @@ def _turned(
 def block_bounds(
     distance: Float[np.ndarray, "nx ny nz"], spacing: float
 ) -> Float[np.ndarray, "bx by bz"]:
-    """Return a lower bound of the distance for everywhere in each block of 4 x 4 x 4 cells.
-
-    Every point of a block is within half a cell's diagonal of one of its nodes (those
-    on its faces included), and distance is 1-Lipschitz. Metres, rounded down to float32.
-    """
+    """Return a lower bound of the distance (metres) for everywhere in each block of 4 x 4 x 4
+    cells: every point is within half a cell's diagonal of a node, and distance is 1-Lipschitz."""
     lowest = distance
     for axis, n in enumerate(distance.shape):
         blocks = (n - 1) // 4 + 1
@@ -208,7 +203,7 @@ def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
     return distance, blocks, floats
 
 
-def configuration(robot: Any, q: Numbers) -> Float[np.ndarray, "dof"]:
+def configuration(robot: Any, q: Numbers) -> Configuration:
     """Return a configuration; whether it is finite is for a verdict to say."""
     array = joint_values(q, robot, "a configuration")
     if array.shape != (robot.dof,):
@@ -216,7 +211,7 @@ def configuration(robot: Any, q: Numbers) -> Float[np.ndarray, "dof"]:
     return array
 
 
-def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Float[np.ndarray, "n dof"]:
+def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Rows:
     """Return configurations; RobotError if the shape is wrong, or one that must be is not
     finite."""
     array = joint_values(Q, robot, "configurations")
@@ -231,14 +226,13 @@ def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Float[np.nda
     return array
 
 
-def waypoints(robot: Any, path: Numbers, single: bool = False) -> Float[np.ndarray, "t dof"]:
+def waypoints(robot: Any, path: Numbers, single: bool = False) -> Waypoints:
     """Return the waypoints (T, dof), T >= 1, of a path whose motion can be bounded; with
     `single`, take one configuration (dof,) for a path, too.
 
     Raises:
         RobotError: the shape is wrong, a value is not finite or far beyond any use (angles
-            lose their last digits there, and motions their bounds), or a sliding joint leaves
-            its limits.
+            lose their last digits there), or a sliding joint leaves its limits.
     """
     array = joint_values(path, robot, "a path")
     rows = array[None] if single and array.ndim == 1 else array

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.world.grid import Vector
 from vprism_plan.world.sources import SourceKind, spoken
 
 Kind = SourceKind | Literal["risk", "self", "joint_limit", "not_finite"]
@@ -18,7 +19,7 @@ Point = tuple[float, float, float]
 _ROBOT_LINK, _WORLD_OBJECT = 0, 1  # moveit_msgs/ContactInformation body types
 
 
-def as_point(values: Float[np.ndarray, "3"]) -> Point:
+def as_point(values: Vector) -> Point:
     """Return three numbers as a tuple."""
     x, y, z = (float(v) for v in values)
     return x, y, z
@@ -31,8 +32,7 @@ class Contact:
     Attributes:
         kind: What the link touches.
         link: Link that touches (for a joint limit: the joint).
-        body: Name of what is touched: "object:3", "table", "background", "occluded",
-            another link, or the limit.
+        body: Name of what is touched (see `world.sources`), another link, or the limit.
         depth: How far the clearance falls short of what is required, metres (for a
             joint limit: how far outside, radians or metres; for a risk: by how much its
             upper bound exceeds `max_risk`).
@@ -101,10 +101,10 @@ class StateReport:
         clearance: Lower bound of the distance to the world, metres; nan if q is not finite.
         self_clearance: Smallest gap between links that may collide, metres; inf if none.
         margin: Clearance that was required, metres.
-        shares: Share of the robot's sphere volume that lies in space that is "occluded",
-            "unobserved" or "outside" the grid: what nobody has seen.
+        shares: Share of the robot's sphere volume that nobody has seen: "occluded",
+            "unobserved" or "outside" the grid.
         policies: What the world does with those spaces ("occupied", "free", "posterior").
-        allowed: Contacts that the rules permit: links that touch objects they may touch.
+        allowed: Contacts that the rules permit.
         warnings: What is usable but odd about the world and the robot, with the remedy.
     """
 
@@ -153,7 +153,7 @@ class FirstContact:
     """What a path touches first, in some of the worlds where it touches anything.
 
     Attributes:
-        body: "object:3", "background", "occluded", "support surface", ...
+        body: as in `Contact`.
         link: link that touches it.
         waypoint: index of the waypoint where, or after which, it does.
         share: share of the colliding worlds; the shares of all causes sum to 1.

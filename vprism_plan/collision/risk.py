@@ -10,17 +10,25 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.special import betaincinv
 
 from vprism_plan._kernels import checking, risk
 from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.explain import nearest_source
-from vprism_plan.collision.packing import AT_MOST, pack_robot, pack_world
+from vprism_plan.collision.packing import (
+    AT_MOST,
+    Configuration,
+    Rows,
+    Waypoints,
+    pack_robot,
+    pack_world,
+)
 from vprism_plan.collision.reports import Contact, FirstContact, RiskEstimate, as_point
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.world import PosteriorWorlds
-from vprism_plan.world.visibility import UNSEEN
+from vprism_plan.world.grid import Chosen
+from vprism_plan.world.visibility import OCCLUDED, OUTSIDE, SEEN, UNSEEN
 
 _HELD_OUT = 1_000_003  # added to the seed of the draws
 _ONE = np.zeros(1, np.int64)
@@ -61,27 +69,21 @@ class Setting:
     """A robot among the worlds of one map.
 
     Attributes:
-        radii: (S,) metres.
-        tables: (rules,) the table of `worlds` that holds for each contact rule.
-        sphere_tables: (S,) the table that holds for each sphere; -1 is not checked.
-        certain: what is an obstacle in every world.
         floats, ints: the robot for the kernels, without joint limits and link pairs.
-        spacing: no sphere centre moves more than this between two samples, metres.
-        margin: metres to keep from what is certain; in `radii` already.
     """
 
     world: Any
     robot: Any
     config: CheckerConfig
     worlds: PosteriorWorlds
-    radii: Float[np.ndarray, " s"]
-    tables: Int[np.ndarray, " g"]
-    sphere_tables: Int[np.ndarray, " s"]
-    certain: Certain
+    radii: Float[np.ndarray, " s"]  # metres
+    tables: Int[np.ndarray, " g"]  # the table of `worlds` that holds for each contact rule
+    sphere_tables: Int[np.ndarray, " s"]  # the table that holds for each sphere; -1 is not checked
+    certain: Certain  # what is an obstacle in every world
     floats: Float[np.ndarray, " f"]
     ints: Int[np.ndarray, " i"]
-    spacing: float
-    margin: float = 0.0
+    spacing: float  # no sphere centre moves more than this between two samples, metres
+    margin: float = 0.0  # metres to keep from what is certain; in `radii` already
 
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,8 +111,7 @@ def make_setting(
     rules: Sequence[Collection[int]],
     link_rules: Int[np.ndarray, " l"],
 ) -> Setting:
-    """Put a setting together from object ids that may be touched, one set per contact rule, and
-    the rule of each link."""
+    """Put a setting together from `config.contact_rules`."""
     arrays = robot.arrays
     moving = ~np.asarray(arrays.link_fixed)[arrays.sphere_link]
     radii = arrays.sphere_radius.copy()  # kernels get it
@@ -136,32 +137,24 @@ def make_setting(
 
 @dataclass(frozen=True)
 class Sweep:
-    """Samples of a path and what they touch.
+    """Samples of a path and what they touch."""
 
-    Attributes:
-        centers: (n, 3, S) sphere centres, metres.
-        slack: (n, S) metres by which the spheres grow to cover the way to the next sample.
-        waypoints: (T,) samples that are waypoints.
-        touched: (n_worlds,) worlds that touch anything.
-        counts: (n,) worlds that touch at each sample.
-        first: (n_worlds,) sample of the first touch, -1 if none.
-    """
-
-    centers: Float[np.ndarray, "n 3 s"]
+    centers: Float[np.ndarray, "n 3 s"]  # sphere centres, metres
+    # metres by which the spheres grow to cover the way to the next sample
     slack: Float[np.ndarray, "n s"]
-    waypoints: Int[np.ndarray, " t"]
-    touched: np.ndarray
-    counts: Int[np.ndarray, " n"]
-    first: Int[np.ndarray, " w"]
+    waypoints: Int[np.ndarray, " t"]  # samples that are waypoints
+    touched: np.ndarray  # worlds that touch anything
+    counts: Int[np.ndarray, " n"]  # worlds that touch at each sample
+    first: Int[np.ndarray, " w"]  # sample of the first touch, -1 if none
 
 
-def count_path(at: Setting, path: Float[np.ndarray, "t dof"]) -> Sweep:
+def count_path(at: Setting, path: Waypoints) -> Sweep:
     """Sample a path without gaps and count the worlds that it touches."""
     if len(path) == 1:
         centers, hits = count_at(at, path[0])
         if hits:
             return count_each(at, path)
-        n, none = at.worlds.n_worlds, np.zeros(1, np.int64)  # most places: nothing to say of worlds
+        n, none = at.worlds.n_worlds, np.zeros(1, np.int64)  # most places: no world is touched
         slack, touched = np.zeros((1, len(at.radii))), np.zeros(n, np.uint8)
         return Sweep(centers[None], slack, none, touched, none, np.full(n, -1))
     steps = np.empty(len(path) - 1, np.int64)
@@ -178,7 +171,7 @@ def count_path(at: Setting, path: Float[np.ndarray, "t dof"]) -> Sweep:
     return Sweep(centers, slack, waypoints, *_touch(at, centers, slack))
 
 
-def count_each(at: Setting, Q: Float[np.ndarray, "n dof"]) -> Sweep:
+def count_each(at: Setting, Q: Rows) -> Sweep:
     """Count the worlds that each configuration touches; nothing between them."""
     centers = np.empty((len(Q), 3, len(at.radii)))
     checking.place_spheres_batch(Q, at.floats, at.ints, centers)
@@ -187,15 +180,13 @@ def count_each(at: Setting, Q: Float[np.ndarray, "n dof"]) -> Sweep:
 
 
 def recount(at: Setting, sweep: Sweep, within: bool = False) -> Sweep:
-    """Count again at a sweep's samples, for spheres of other radii.
-
-    With `within`, the samples alone, not the way between them.
-    """
+    """Count again at a sweep's samples, for spheres of other radii; with `within`, the samples
+    alone, not the way between them."""
     slack = np.zeros_like(sweep.slack) if within else sweep.slack
     return Sweep(sweep.centers, slack, sweep.waypoints, *_touch(at, sweep.centers, slack))
 
 
-def count_at(at: Setting, q: Float[np.ndarray, "dof"]) -> tuple[Float[np.ndarray, "3 s"], int]:
+def count_at(at: Setting, q: Configuration) -> tuple[Float[np.ndarray, "3 s"], int]:
     """Sphere centres at a configuration, and how many worlds they touch: the quick way."""
     worlds = at.worlds
     centers = np.empty((3, len(at.radii)))
@@ -237,7 +228,7 @@ def _touch(
 
 
 def first_contacts(
-    at: Setting, path: Float[np.ndarray, "t dof"], sweep: Sweep, edge: int, fraction: float
+    at: Setting, path: Waypoints, sweep: Sweep, edge: int, fraction: float
 ) -> tuple[FirstContact, ...]:
     """Rank what the worlds collide with first; certain obstacles stop all that are left."""
     if edge < 0 and not sweep.touched.any():
@@ -259,11 +250,9 @@ def first_contacts(
 
 
 def risky_contacts(at: Setting, sweep: Sweep, upper: float) -> tuple[Contact, ...]:
-    """Which links touch which objects in how many worlds, the most frequent first.
-
-    Each world counts for its deepest contact alone, so the shares add up to the probability
-    of collision, whose upper bound is given.
-    """
+    """Which links touch which objects in how many worlds, the most frequent first. Each world
+    counts for its deepest contact alone: the shares add up to the probability of collision, whose
+    upper bound is given."""
     bound = at.config.max_risk
     return tuple(
         Contact(
@@ -301,9 +290,7 @@ def _touching(
     )
 
 
-def _certain_cause(
-    at: Setting, path: Float[np.ndarray, "t dof"], edge: int, fraction: float
-) -> tuple[str, str]:
+def _certain_cause(at: Setting, path: Waypoints, edge: int, fraction: float) -> tuple[str, str]:
     """Name the body and the link of the deepest certain contact at a point of an edge."""
     qa, qb = path[edge], path[min(edge + 1, len(path) - 1)]
     q = qa + fraction * (qb - qa)
@@ -358,11 +345,8 @@ class PathRisk:
                 worlds.bake(without=ids)
 
     def tightened(self, level: int) -> "PathRisk | None":
-        """Return the same with a stricter bound on verdicts, None if there is none left.
-
-        Halves the worlds that may collide, down to none, then grows the spheres by half, one
-        and two voxels. What the stricter one accepts, this one accepts.
-        """
+        """Return the same with a stricter bound on verdicts, None if there is none left: halves
+        the worlds that may collide, down to none, then grows the spheres by `PADDINGS`."""
         stricter = copy.copy(self)
         halvings = self.allowed.bit_length()  # after so many, none is left
         stricter.allowed = self.allowed >> min(level, halvings)
@@ -383,16 +367,16 @@ class PathRisk:
         return self._held_out
 
     # --- verdicts ----------------------------------------------------------------------
-    def accepts(self, path: Float[np.ndarray, "t dof"]) -> bool:
+    def accepts(self, path: Waypoints) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
         obstacles aside."""
         return bool(count_path(self._kept, path).touched.sum() <= self.allowed)
 
-    def accepts_one(self, q: Float[np.ndarray, "dof"]) -> bool:
+    def accepts_one(self, q: Configuration) -> bool:
         """Return `accepts` of one configuration: the quick way."""
         return count_at(self._kept, q)[1] <= self.allowed
 
-    def accepts_each(self, Q: Float[np.ndarray, "n dof"]) -> Bool[np.ndarray, " n"]:
+    def accepts_each(self, Q: Rows) -> Chosen:
         """Return `accepts` of each configuration by itself."""
         return count_each(self._kept, Q).counts <= self.allowed
 
@@ -402,13 +386,13 @@ class PathRisk:
         first = np.sort(sweep.first[sweep.first >= 0])
         return float(first[self.allowed]) / max(1, len(sweep.counts) - 1)
 
-    def contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
+    def contacts(self, q: Configuration) -> tuple[Contact, ...]:
         """Return which links touch which objects in how many worlds, the most frequent first."""
         sweep = count_path(self._kept, q[None])
         return risky_contacts(self._kept, sweep, float(self._upper[int(sweep.touched.sum())]))
 
     # --- estimates ---------------------------------------------------------------------
-    def estimate(self, path: Float[np.ndarray, "t dof"], with_margin: bool = False) -> RiskEstimate:
+    def estimate(self, path: Waypoints, with_margin: bool = False) -> RiskEstimate:
         """Return the joint probability of collision along a path, or of coming within the
         margin; of a configuration, where the path has one row."""
         at = grown(self._kept, -CORNER) if with_margin else self.setting
@@ -452,14 +436,9 @@ class PathRisk:
 
 
 class SpaceCodes:
-    """What is known of the space around each node of a world's grid.
-
-    0: seen, or hidden where the map has support. 1: hidden without support. 2: never
-    observed. 3 (not stored): outside the grid. Baked once, O(nodes), one byte per node.
-
-    Args:
-        world: a `vprism_plan.world.World`.
-    """
+    """What is known of the space around each node of a world's grid, by the codes of
+    `visibility`: SEEN also where it is hidden and the map has support. Baked once, O(nodes), one
+    byte per node."""
 
     def __init__(self, world: Any) -> None:
         field = world.field
@@ -473,10 +452,10 @@ class SpaceCodes:
             corner = self._origin + self._spacing * np.array([start, 0, 0])
             points = corner + self._spacing * index
             codes = np.asarray(world.status(points)).astype(np.uint8)
-            codes[codes == 3] = 0  # rounding at the faces
-            hidden = np.flatnonzero(codes == 1)
+            codes[codes == OUTSIDE] = SEEN  # rounding at the faces
+            hidden = np.flatnonzero(codes == OCCLUDED)
             judged = np.asarray(world.map.support(points[hidden])) >= world.config.min_support
-            codes[hidden[judged]] = 0
+            codes[hidden[judged]] = SEEN
             self._codes[start:stop] = codes.reshape(stop - start, *shape[1:])
 
     def shares(
@@ -485,12 +464,9 @@ class SpaceCodes:
         radii: Float[np.ndarray, " s"],
         rules: Int[np.ndarray, " s"],
     ) -> dict[str, float]:
-        """Return the share of the swept volume that lies in each kind of space not judged.
-
-        Seven points per ball (its centre and six at three fifths of the radius), balls
-        weighted by volume, averaged over at most 64 samples spread along the path.
-        Balls with rule -1 (not checked) do not count.
-        """
+        """Return the share of the swept volume that lies in each kind of space not judged: seven
+        points per ball (its centre and six at three fifths of the radius), balls weighted by
+        volume, over at most 64 samples spread along the path; none of balls with rule -1."""
         n = len(centers)
         chosen = _ONE if n == 1 else np.arange(m := min(n, _MAX_SAMPLES)) * (n - 1) // (m - 1)
         totals = np.zeros(4)
@@ -517,11 +493,8 @@ def clopper_pearson(
 
 
 def tolerated_hits(max_risk: float, upper: Float[np.ndarray, " n1"], n_worlds: int) -> int:
-    """Return the most hits whose upper bound is still within `max_risk`.
-
-    Raises:
-        ConfigError: not even no hits at all would do, with so few worlds.
-    """
+    """Return the most hits whose upper bound is still within `max_risk`; ConfigError if not even
+    none would do, with so few worlds."""
     allowed = int(np.searchsorted(upper, max_risk, side="right")) - 1
     if allowed < 0:
         raise ConfigError(

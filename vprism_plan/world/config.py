@@ -44,7 +44,7 @@ class Box(Primitive):
         object.__setattr__(self, "T_world", _pose(owner, self.T_world))
 
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Exact distance from world points to the box, metres, negative inside."""
+        """See `Primitive`."""
         local = (points - self.T_world[:3, 3]) @ self.T_world[:3, :3]
         return _from_slabs(np.abs(local) - 0.5 * self.size)
 
@@ -68,7 +68,7 @@ class Sphere(Primitive):
         object.__setattr__(self, "center", _vector(owner, "center", self.center))
 
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Exact distance from world points to the ball, metres, negative inside."""
+        """See `Primitive`."""
         return np.linalg.norm(points - self.center, axis=1) - self.radius
 
     def box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
@@ -92,7 +92,7 @@ class Cylinder(Primitive):
         object.__setattr__(self, "T_world", _pose(owner, self.T_world))
 
     def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Exact distance from world points to the cylinder, metres, negative inside."""
+        """See `Primitive`."""
         local = (points - self.T_world[:3, 3]) @ self.T_world[:3, :3]
         radial = np.hypot(local[:, 0], local[:, 1]) - self.radius
         return _from_slabs(np.stack([radial, np.abs(local[:, 2]) - 0.5 * self.length], axis=1))

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan.errors import WorldError
 from vprism_plan.world.distance import Lattice, lattice_nodes
+from vprism_plan.world.grid import Chosen, Index, Points, Values
 
 # How far the second derivatives may exceed their finite-difference estimate.
 _CURVATURE_SAFETY = 2.0
@@ -39,42 +40,32 @@ _HALVES = np.array(
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells of one size of the octree.
+    """Cells of one size of the octree."""
 
-    Attributes:
-        index: (n, 3) lowest corner, in units of the finest lattice spacing.
-        size: edge length in the same units.
-        label: (n,) most probable object (class 1..C) at the most occupied corner of the
-            evaluated cell that contains it.
-        around: (n, 8) the same at each corner of that cell, 0 where it is not occupied.
-    """
-
-    index: Int[np.ndarray, "n 3"]
-    size: int
+    index: Int[np.ndarray, "n 3"]  # lowest corner, in units of the finest lattice spacing
+    size: int  # edge length in the same units
+    # most probable object (class 1..C) at the most occupied corner of the evaluated cell that
+    # contains it
     label: UInt8[np.ndarray, " n"]
+    # the same at each corner of that cell, 0 where it is not occupied
     around: UInt8[np.ndarray, "n 8"]
 
-    def select(self, chosen: Bool[np.ndarray, " n"]) -> "Cells":
+    def select(self, chosen: Chosen) -> "Cells":
         """Return only the chosen cells."""
         return Cells(self.index[chosen], self.size, self.label[chosen], self.around[chosen])
 
 
 @dataclass(frozen=True)
 class LevelSet:
-    """A cover of the level set, on a lattice whose node (0, 0, 0) is the world origin.
+    """A cover of the level set, on a lattice whose node (0, 0, 0) is the world origin."""
 
-    Attributes:
-        spacing: of the lattice, metres.
-        cells: those that lie wholly inside, by size, and last those of one lattice step in
-            which the level may be reached.
-        evaluations: how many points of the map were evaluated.
-    """
-
-    spacing: float
+    spacing: float  # of the lattice, metres
+    # those that lie wholly inside, by size, and last those of one lattice step in which the level
+    # may be reached
     cells: tuple[Cells, ...]
-    evaluations: int
+    evaluations: int  # how many points of the map were evaluated
 
-    def box(self) -> tuple[Int[np.ndarray, " 3"], Int[np.ndarray, " 3"]] | None:
+    def box(self) -> tuple[Index, Index] | None:
         """First and last lattice node of the cover, or None if it is empty."""
         parts = [cells for cells in self.cells if len(cells.index)]
         if not parts:
@@ -84,15 +75,13 @@ class LevelSet:
         return lower, upper
 
 
-def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Values:
     """log P(occupied) / P(empty) from class probabilities (class 0 is empty)."""
     empty = np.clip(probabilities[:, 0], 1e-18, 1.0)
     return np.log(np.clip(probabilities[:, 1:].sum(axis=1), 1e-18, None)) - np.log(empty)
 
 
-def _evaluate(
-    map_: Any, points: Float[np.ndarray, "n 3"], level: float
-) -> tuple[Float[np.ndarray, " n"], UInt8[np.ndarray, " n"]]:
+def _evaluate(map_: Any, points: Points, level: float) -> tuple[Values, UInt8[np.ndarray, " n"]]:
     """Log-odds less those of the level, and the most probable object class, at points."""
     values = np.empty(len(points))
     labels = np.empty(len(points), dtype=np.uint8)
@@ -118,13 +107,10 @@ def _unique_nodes(
     return found + low, inverse.reshape(keys.shape)
 
 
-def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Float[np.ndarray, " n"]:
+def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Values:
     """Sum over the axes of the largest second difference."""
-    total = np.zeros(len(g))
-    for axis in (1, 2, 3):
-        second = np.abs(np.diff(g, n=2, axis=axis))
-        total += second.reshape(len(g), -1).max(axis=1, initial=0.0)
-    return total
+    second = (np.abs(np.diff(g, n=2, axis=axis)) for axis in (1, 2, 3))
+    return np.sum([part.max(axis=(1, 2, 3), initial=0.0) for part in second], axis=0)
 
 
 def lattice_refinement(resolution: float, kernel_length: float) -> int:
@@ -136,12 +122,9 @@ def lattice_refinement(resolution: float, kernel_length: float) -> int:
 
 
 def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
-    """Cover {P(occupied) >= level} with cells of a lattice of the given spacing.
+    """Cover {P(occupied) >= level} with cells, the finest of them `spacing` (metres) wide.
 
-    Args:
-        map_: `predict_proba`, `support_bounds`, `unsupported_occupancy`, `kernel_length`.
-        spacing: of the finest lattice, metres; its node (0, 0, 0) is the world origin.
-        level: probability.
+    `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`.
 
     Raises:
         WorldError: the map says "occupied" where it has no evidence at all, or the cells would
@@ -194,10 +177,8 @@ def _divide(
     owners: UInt8[np.ndarray, "n 3 3 3"],
     step: float,
 ) -> tuple[Cells, Cells]:
-    """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide.
-
-    Children with more than one object at their corners are divided too.
-    """
+    """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
+    those with more than one object at their corners."""
     spread = np.ptp(g, axis=(1, 2, 3))
     # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
     slack = _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
@@ -214,15 +195,10 @@ def _divide(
 
 
 def _ownership(
-    corners: Float[np.ndarray, "n 8"],
-    owners: UInt8[np.ndarray, "n 8"],
-    slack: Float[np.ndarray, " n"],
+    corners: Float[np.ndarray, "n 8"], owners: UInt8[np.ndarray, "n 8"], slack: Values
 ) -> tuple[UInt8[np.ndarray, " n"], UInt8[np.ndarray, "n 8"]]:
-    """Owner at the most occupied corner, and at all corners that may be occupied.
-
-    Off the objects the likeliest of them says little: counted there, the skin of one
-    object would belong to another.
-    """
+    """Owner at the most occupied corner, and at all corners that may be occupied: counted
+    elsewhere, the skin of one object would belong to another."""
     best = corners.argmax(axis=1)
     rows = np.arange(len(corners))
     around = np.where(corners >= -slack[:, None], owners, np.uint8(0))
@@ -257,12 +233,9 @@ def _border(
 
 
 def _join(parts: list[Cells]) -> Cells:
-    return Cells(
-        np.concatenate([part.index for part in parts]),
-        parts[0].size,
-        np.concatenate([part.label for part in parts]),
-        np.concatenate([part.around for part in parts]),
-    )
+    columns = zip(*((part.index, part.label, part.around) for part in parts), strict=True)
+    index, label, around = (np.concatenate(column) for column in columns)
+    return Cells(index, parts[0].size, label, around)
 
 
 def rasterize_level_set(
@@ -270,8 +243,8 @@ def rasterize_level_set(
 ) -> Lattice | None:
     """Mark the corners of the cells of a level set with the object class found there.
 
-    With `classes`, only cells in which one of these classes is the most probable at
-    some corner, and the whole of such cells. None if there is no cell.
+    With `classes`, only, and the whole of, cells in which one of these is the most probable at
+    some corner. None if there is no cell.
     """
     cells = level_set.cells
     if classes is not None:

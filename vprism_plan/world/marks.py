@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 from scipy import ndimage
 
 from vprism_plan._kernels import world as kernels
@@ -16,7 +16,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.world import visibility
 from vprism_plan.world.config import KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import Lattice, bounding, lattice_nodes
-from vprism_plan.world.grid import Grid, corners, window
+from vprism_plan.world.grid import Grid, Nodes, Points, Shape3, Values, Vector, corners, window
 from vprism_plan.world.seen import (
     Cone,
     Surface,
@@ -55,7 +55,7 @@ class Evidence:
         self.without_depth = tuple(sorted(found - set(map_.object_ids)))
 
     @cached_property
-    def _clutter(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    def _clutter(self) -> tuple[Points, Values]:
         config = self._config
         return visibility.background_points(
             self._map.views, self._map.plane, config.background_height, config.lone_share,
@@ -71,11 +71,7 @@ class Evidence:
         return [lost_cones(view, self._map.plane) for view in self._map.views]
 
     def marks(
-        self,
-        occluded: OccludedPolicy,
-        grid: Grid,
-        objects: Float32[np.ndarray, "nx ny nz"] | None,
-        inner: Grid | None = None,
+        self, occluded: OccludedPolicy, grid: Grid, objects: Nodes | None, inner: Grid | None = None
     ) -> Lattice:
         """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
         object of the map holds.
@@ -119,11 +115,7 @@ class Evidence:
         return Lattice(nodes, grid.first * CELLS, CELLS)
 
     def _status(
-        self,
-        occluded: OccludedPolicy,
-        origin: Float[np.ndarray, " 3"],
-        spacing: float,
-        shape: tuple[int, int, int],
+        self, occluded: OccludedPolicy, origin: Vector, spacing: float, shape: Shape3
     ) -> UInt8[np.ndarray, "nx ny nz"]:
         """What the views say of cells, and, where it decides, the posterior."""
         place = self._map.plane, origin, spacing, shape
@@ -135,9 +127,7 @@ class Evidence:
             _trust_posterior(self._map, self._config, status, origin, spacing)
         return status
 
-    def _seen(
-        self, grid: Grid, objects: Float32[np.ndarray, "nx ny nz"] | None, step: float
-    ) -> Iterator[Surface]:
+    def _seen(self, grid: Grid, objects: Nodes | None, step: float) -> Iterator[Surface]:
         """Marks, points and half the widths of what was seen, the less important first."""
         yield MARKED["background"], *self._clutter
         for k, points, half in self._surfaces:
@@ -155,7 +145,7 @@ def _trust_posterior(
     map_: Any,
     config: WorldConfig,
     status: UInt8[np.ndarray, "nx ny nz"],
-    origin: Float[np.ndarray, " 3"],
+    origin: Vector,
     spacing: float,
 ) -> None:
     """Call occluded cells free where the map has support: the posterior decides there. Not
@@ -226,9 +216,8 @@ def only(marks: Lattice, label: int) -> Lattice:
 def rasterize_mesh(known: KnownMesh, grid: Grid, factor: int) -> Lattice:
     """Mark every cell a mesh touches, and its inside if it is watertight.
 
-    The surface is divided until its edges are no longer than a cell; every point of a
-    triangle is then within edge / sqrt(3) of a corner, and the cells that a cube of that
-    size round a corner touches are marked.
+    The surface is divided until its edges are no longer than a cell; every point of a triangle is
+    then within edge / sqrt(3) of a corner, and the cells within that are marked.
     """
     import trimesh
 
@@ -249,10 +238,7 @@ def rasterize_mesh(known: KnownMesh, grid: Grid, factor: int) -> Lattice:
 
 
 def _fill_inside(
-    labels: np.ndarray,
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    triangles: Float[np.ndarray, "f 3 3"],
+    labels: np.ndarray, origin: Vector, spacing: float, triangles: Float[np.ndarray, "f 3 3"]
 ) -> None:
     """Mark the unmarked regions that lie inside a closed surface, one test per region."""
     regions, count = ndimage.label(labels == 0)
@@ -267,7 +253,7 @@ def _fill_inside(
             labels[regions == region] = 1
 
 
-def winding_number(point: Float[np.ndarray, " 3"], triangles: Float[np.ndarray, "f 3 3"]) -> float:
+def winding_number(point: Vector, triangles: Float[np.ndarray, "f 3 3"]) -> float:
     """How often a closed surface winds round a point: its solid angle over 4 pi.
 
     Van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), eq. 8.

@@ -7,13 +7,13 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 from scipy import ndimage
 
 from vprism_plan._arguments import number, whole
 from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.world.config import check_level
-from vprism_plan.world.grid import corners, window
+from vprism_plan.world.grid import Index, Points, Vector, corners, window
 
 if TYPE_CHECKING:
     import trimesh
@@ -39,7 +39,6 @@ def extract_meshes(
         resolution: edge of the marching cubes, metres.
 
     Raises:
-        ConfigError: level or resolution is out of range.
         WorldError: a surface could not be closed.
     """
     probabilities, origin = _sample(map, level, resolution)
@@ -70,7 +69,7 @@ def extract_union_mesh(
 
 def _sample(
     map_: Any, level: float, resolution: float
-) -> tuple[Float[np.ndarray, "nx ny nz k"], Float[np.ndarray, " 3"]]:
+) -> tuple[Float[np.ndarray, "nx ny nz k"], Vector]:
     """Class probabilities on a grid over the map's support, with an empty layer round it."""
     check_level(level)
     check_spacing(resolution, "resolution")
@@ -80,13 +79,11 @@ def _sample(
 
 
 def surface(
-    inside: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, " 3"], resolution: float
+    inside: Float[np.ndarray, "nx ny nz"], origin: Vector, resolution: float
 ) -> "trimesh.Trimesh | None":
-    """Surface {inside = 0} around {inside > 0}; None if there is none.
-
-    A vertex that nearly coincides with a node leaves triangles without area and, when
-    those are merged, holes: values this close to 0 are pushed away from it first.
-    """
+    """Surface {inside = 0} around {inside > 0}; None if there is none. A vertex that nearly
+    coincides with a node leaves triangles without area and, when those are merged, holes: values
+    this close to 0 are pushed away from it first."""
     import trimesh
     from skimage.measure import marching_cubes
 
@@ -122,14 +119,12 @@ def extract_refined_meshes(
     its nodes is not found. An object of which nothing is found is left out, with a warning.
 
     Args:
-        map: a `VPrismMap`.
-        level: probability in (0, 1).
+        map, level: as there.
         spacing: edge of the marching cubes, metres.
-        halvings: how often cells are halved; None takes the coarsest first grid that is
+        halvings: how often cells are halved, up to 8; None takes the coarsest first grid that is
             no wider than half a kernel length.
 
     Raises:
-        ConfigError: level, spacing or halvings is out of range.
         WorldError: a surface could not be closed.
     """
     check_level(level)
@@ -167,8 +162,8 @@ def _inside(
 
 
 def _cropped(
-    values: Float[np.ndarray, "nx ny nz"], first: Int[np.ndarray, " 3"]
-) -> tuple[Float[np.ndarray, "mx my mz"], Int[np.ndarray, " 3"]]:
+    values: Float[np.ndarray, "nx ny nz"], first: Index
+) -> tuple[Float[np.ndarray, "mx my mz"], Index]:
     """Keep three cells of room around the object: halving may move its surface by two."""
     hits = np.argwhere(values > 0)
     low = np.maximum(hits.min(axis=0) - 3, 0)
@@ -181,11 +176,11 @@ def _halved(
     k: int,
     level: float,
     values: Float[np.ndarray, "nx ny nz"],
-    corner: Int[np.ndarray, " 3"],
+    corner: Index,
     halvings: int,
     spacing: float,
     wide: bool,
-) -> tuple[Float[np.ndarray, "mx my mz"], Int[np.ndarray, " 3"]]:
+) -> tuple[Float[np.ndarray, "mx my mz"], Index]:
     """Values on nodes half as far apart, evaluated where the surface may run, if `wide` in the
     cells around as well; `halvings` still to come, `corner` in steps of the given grid."""
     check_size(2 * np.array(values.shape), spacing, "spacing")
@@ -246,7 +241,7 @@ def check_size(shape: Any, spacing: float, name: str, most: int = _MAX_NODES) ->
         )
 
 
-def predicted(source: Any, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n k"]:
+def predicted(source: Any, points: Points) -> Float32[np.ndarray, "n k"]:
     """Return `source.predict_proba` at points (metres), asked for piece by piece."""
     out = np.empty((len(points), len(source.object_ids) + 1), dtype=np.float32)
     for start in range(0, len(points), _CHUNK):
@@ -256,13 +251,8 @@ def predicted(source: Any, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarr
 
 
 def sample_box(
-    source: Any,
-    lower: Float[np.ndarray, " 3"],
-    upper: Float[np.ndarray, " 3"],
-    spacing: float,
-    name: str,
-    most: int = _MAX_NODES,
-) -> tuple[Float32[np.ndarray, "nx ny nz k"], Int[np.ndarray, " 3"]]:
+    source: Any, lower: Vector, upper: Vector, spacing: float, name: str, most: int = _MAX_NODES
+) -> tuple[Float32[np.ndarray, "nx ny nz k"], Index]:
     """Return class probabilities over a box (corners, metres) and a layer around it in which
     all is empty, at whole multiples of the spacing (metres; `name` is what the user calls it),
     and the first node in steps. `source` has `object_ids` and `predict_proba`.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, UInt8
+from jaxtyping import Bool, Int, Int32, UInt8
 from scipy import ndimage
 from scipy.special import ndtr
 
@@ -18,7 +18,7 @@ from vprism_plan._kernels.risk import BLOCK
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
 from vprism_plan.world.distance import checked_points
-from vprism_plan.world.grid import window
+from vprism_plan.world.grid import Chosen, Index, Points, Shape3, Slices, Values, window
 
 _MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
 _FINEST = 16.0  # stored steps per voxel, at most
@@ -42,11 +42,10 @@ class PosteriorWorlds:
     the level of the mesh, and belongs to the object of the largest logit. The same draw
     holds everywhere, so what hides in one place is correlated with what hides next to it.
 
-    Per voxel and draw one byte holds the distance to the nearest occupied voxel centre,
-    rounded down. A ball is compared with it at the nodes of the cell around its centre; what
-    they leave open is looked up voxel by voxel. An occupied voxel counts as the ball
-    inscribed in it: a draw is touched if the centre of a voxel it occupies is within
-    radius + resolution / 2 of a ball's centre.
+    Per voxel and draw one byte holds the distance to the nearest occupied voxel centre, rounded
+    down, and is compared with a ball at the nodes of the cell around its centre; what they leave
+    open is looked up voxel by voxel. An occupied voxel counts as the ball inscribed in it: a draw
+    is touched if the centre of one is within radius + resolution / 2 of a ball's centre.
 
     Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when
     the first ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the
@@ -61,7 +60,7 @@ class PosteriorWorlds:
         reach: distances up to this are known, metres: two and a half voxels more than the
             largest ball that will be asked about. At most 31 voxels.
         tolerance: how probable it may be that skipping the draws of nearly certain voxels
-            changes any answer (see `error_free`, `error_occupied`).
+            changes any answer.
 
     Attributes:
         error_free: bound on the probability that a draw differs in a voxel that was called
@@ -133,11 +132,9 @@ class PosteriorWorlds:
         )
 
     def redrawn(self, seed: int) -> "PosteriorWorlds":
-        """Return as many other worlds of the same map, with nothing baked yet.
-
-        Shares what does not depend on the draws. A path that was chosen because few of these
-        worlds object to it is judged fairly only by worlds that had no say in the choice.
-        """
+        """Return as many other worlds of the same map, with nothing baked yet: a path that was
+        chosen because few of these object to it is judged fairly only by worlds that had no say
+        in the choice."""
         other = copy.copy(self)
         other.seed = seed
         other._owners = self._owners.redrawn(seed)
@@ -159,17 +156,9 @@ class PosteriorWorlds:
 
     # --- what is where ---------------------------------------------------------------
     def owners(self, index: Int[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n s"]:
-        """Return which object occupies each voxel in each draw.
-
-        Args:
-            index: (n, 3) voxel indices: centres are `resolution * index`, metres.
-
-        Returns:
-            (n, S): 0 free, k the object `map.object_ids[k - 1]`.
-
-        Raises:
-            WorldError: index is not (n, 3) integers.
-        """
+        """Return which object occupies each voxel (centres are `resolution * index`, metres) in
+        each draw: 0 free, k the object `map.object_ids[k - 1]`; WorldError if index is not (n, 3)
+        integers."""
         index = np.asarray(index)
         if index.ndim != 2 or index.shape[1] != 3 or not np.issubdtype(index.dtype, np.integer):
             raise WorldError(
@@ -184,10 +173,7 @@ class PosteriorWorlds:
         return out
 
     def touched(
-        self,
-        centers: Float[np.ndarray, "n 3"],
-        radii: Any,
-        without: Collection[int] = (),
+        self, centers: Points, radii: Any, without: Collection[int] = ()
     ) -> Bool[np.ndarray, "n s"]:
         """Return in which draws each ball touches an occupied voxel.
 
@@ -195,7 +181,7 @@ class PosteriorWorlds:
         a path touches anything is `touched(...).any(axis=0).mean()`.
 
         Args:
-            centers: (n, 3) world coordinates, metres.
+            centers: world, metres.
             radii: of all balls, or of each (n,), metres.
             without: ids of objects that may be touched.
 
@@ -227,7 +213,7 @@ class PosteriorWorlds:
         blocks = np.moveaxis(np.indices(tuple(np.maximum(high - low, 0))), 0, -1).reshape(-1, 3)
         self._bake(self.rule(without), blocks + low)
 
-    def _block_at(self, corner: Any) -> Int[np.ndarray, " 3"]:
+    def _block_at(self, corner: Any) -> Index:
         point = checked_points(np.reshape(np.asarray(corner, dtype=np.float64), (1, -1)))[0]
         return np.floor((point / self.resolution - self.first + 0.5) / BLOCK).astype(int)
 
@@ -254,11 +240,7 @@ class PosteriorWorlds:
                 self._bake(rule, np.argwhere(wanted[rule]))
 
     def rule(self, without: Collection[int]) -> int:
-        """Return the index of the table that leaves out some objects; makes it if needed.
-
-        Raises:
-            WorldError: the map has no such object.
-        """
+        """Return the index of the table that leaves out some objects; makes it if needed."""
         gone = frozenset(classes_of(self.map, without))
         with self._lock:
             if gone not in self._rules:
@@ -297,7 +279,7 @@ class PosteriorWorlds:
             grown[near] = kernels.UNBAKED
         return grown
 
-    def _blocks_of_table(self) -> tuple[int, int, int]:
+    def _blocks_of_table(self) -> Shape3:
         x, y, z = (-(-n // BLOCK) for n in self._grown.shape)
         return x, y, z
 
@@ -337,11 +319,11 @@ class PosteriorWorlds:
                 target = updated[rule][_block_slices(block)]
                 part = rows[tuple(slice(n) for n in target.shape)]
                 target[part >= 0] = part[part >= 0] + len(old.rows)
-            rows, lowest = [old.rows, fresh], [old.lowest, fresh.min(axis=1)]
-            self.tables = Tables(updated, np.concatenate(rows), np.concatenate(lowest))
+            grown, lowest = [old.rows, fresh], [old.lowest, fresh.min(axis=1)]
+            self.tables = Tables(updated, np.concatenate(grown), np.concatenate(lowest))
 
 
-def _block_slices(block: Int[np.ndarray, " 3"]) -> tuple[slice, slice, slice]:
+def _block_slices(block: Index) -> Slices:
     return window(BLOCK * block, BLOCK * (block + 1))
 
 
@@ -356,19 +338,10 @@ def classes_of(map_: Any, object_ids: Collection[int]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """What every draw is taken to say of each voxel before any is drawn.
+    """What every draw is taken to say of each voxel before any is drawn, as `Owners` keeps it;
+    bounds on the probability that a draw differs in any voxel called free, or occupied."""
 
-    Attributes:
-        first: index of voxel (0, 0, 0); voxel i has its centre at resolution * (first + i).
-        row: (nx, ny, nz) int32: -1 free in every draw; k - 1 < C class k in every draw;
-            from C on, the voxels that have to be drawn.
-        voxels: (n, 3) the latter, in the order of their rows.
-        error_free: bound on the probability that a draw occupies any voxel called free.
-        error_occupied: bound on the probability that a draw frees, or gives to another
-            object, any voxel called occupied.
-    """
-
-    first: Int[np.ndarray, " 3"]
+    first: Index
     row: Int32[np.ndarray, "nx ny nz"]
     voxels: Int[np.ndarray, "n 3"]
     error_free: float
@@ -378,13 +351,12 @@ class Verdicts:
 def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
     """Find the voxels whose draws are certain, so that nobody has to draw them.
 
-    With Gaussian logits z of mean m and variance v, and C objects, a draw occupies a
-    voxel only if some z_k - z_0 > -ln C: by the union bound its probability is at most
-    sum_k Phi(-(m_0 - m_k - ln C) / sqrt(v_0 + v_k)). It does not give the voxel to class k
-    only if z_k < z_0 or z_k < z_j for another object j: a sum of the same form. The voxels
-    with the smallest bounds are skipped, as many as sum up to half the tolerance each
-    way; the sum bounds the probability that any of them is wrong, so it bounds the error
-    of the probability of any event, a path's collision included.
+    With Gaussian logits z of mean m and variance v, and C objects, a draw occupies a voxel only
+    if some z_k - z_0 > -ln C: by the union bound its probability is at most
+    sum_k Phi(-(m_0 - m_k - ln C) / sqrt(v_0 + v_k)). It does not give the voxel to class k only
+    if z_k < z_0 or z_k < z_j for another object j: a sum of the same form. The voxels with the
+    smallest bounds are skipped, as many as sum up to half the tolerance each way: that bounds
+    the error of the probability of any event, a path's collision included.
     """
     lower, upper = (np.asarray(corner) for corner in map_.support_bounds())
     n_objects = len(map_.object_ids)
@@ -416,8 +388,8 @@ def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
 
 
 def _tails(
-    map_: Any, first: Int[np.ndarray, " 3"], shape: Int[np.ndarray, " 3"], resolution: float
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], UInt8[np.ndarray, " n"]]:
+    map_: Any, first: Index, shape: Index, resolution: float
+) -> tuple[Values, Values, UInt8[np.ndarray, " n"]]:
     """Bounds on P(occupied) and P(not the likeliest object's) of each voxel, and that object."""
     n = int(np.prod(shape))
     occupied, lost, owner = np.empty(n), np.empty(n), np.empty(n, np.uint8)
@@ -429,24 +401,20 @@ def _tails(
         index = np.moveaxis(np.indices((stop - start, int(shape[1]), int(shape[2]))), 0, -1)
         points = resolution * (index.reshape(-1, 3) + first + [start, 0, 0])
         mean, variance = map_.logit_moments(points)
-        piece = slice(start * slab, stop * slab)
+        piece, rows = slice(start * slab, stop * slab), np.arange(len(points))
         gap = mean[:, 1:] - mean[:, :1]
         spread = np.sqrt(variance[:, 1:] + variance[:, :1])
         occupied[piece] = ndtr((gap + np.log(n_objects)) / spread).sum(axis=1)
         best = gap.argmax(axis=1)
-        rows = np.arange(len(mean))
-        miss = ndtr(-gap[rows, best] / spread[rows, best])
-        lead = (gap[rows, best, None] - gap) / np.sqrt(
-            variance[rows, 1 + best, None] + variance[:, 1:]
-        )
-        others = ndtr(-lead)
+        apart = np.sqrt(variance[rows, 1 + best, None] + variance[:, 1:])
+        others = ndtr((gap - gap[rows, best, None]) / apart)
         others[rows, best] = 0.0
-        lost[piece] = miss + others.sum(axis=1)
+        lost[piece] = ndtr(-gap[rows, best] / spread[rows, best]) + others.sum(axis=1)
         owner[piece] = best + 1
     return occupied, lost, owner
 
 
-def _skippable(bound: Float[np.ndarray, " n"], budget: float) -> Bool[np.ndarray, " n"]:
+def _skippable(bound: Values, budget: float) -> Chosen:
     """Mark the entries with the smallest bounds, as many as sum up to at most the budget."""
     order = np.argsort(bound, kind="stable")
     count = int(np.searchsorted(np.cumsum(bound[order]), budget, side="right"))
@@ -456,16 +424,7 @@ def _skippable(bound: Float[np.ndarray, " n"], budget: float) -> Bool[np.ndarray
 
 
 class Owners:
-    """Owners of the voxels of a map's support in S draws.
-
-    One thread at a time may `draw`.
-
-    Args:
-        map_: a `VPrismMap`.
-        n_worlds: S.
-        seed: of the draws.
-        resolution: edge of a voxel, metres.
-        verdicts: what needs no drawing.
+    """Owners of the voxels of a map's support in S draws. One thread at a time may `draw`.
 
     Attributes:
         first: index of voxel (0, 0, 0): the centre of voxel i is resolution * (first + i).
@@ -556,7 +515,7 @@ class Owners:
             self.table[first_row + members] = found
             self._drawn[block] = True
 
-    def _classify(self, points: Float[np.ndarray, "n 3"], out: UInt8[np.ndarray, "n s"]) -> None:
+    def _classify(self, points: Points, out: UInt8[np.ndarray, "n s"]) -> None:
         """Fill in the class that occupies each point (m) in each draw; 0 is none.
 
         O(points x hinges near any x S x K): points should be near each other.

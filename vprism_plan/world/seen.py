@@ -14,24 +14,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
-from vprism_plan._kernels import world as kernels
-from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import height_sigma, inlier_band, pixel_rays
 from vprism_plan.perception.plane import TableRegion, table_region
-from vprism_plan.world.distance import bounding
-from vprism_plan.world.grid import Grid
+from vprism_plan.world.distance import bounding, lower_bounds
+from vprism_plan.world.grid import Chosen, Grid, Image, Mask, Nodes, Points, Values, Vector
 from vprism_plan.world.visibility import THIN, beside
 
 _STRAY_SHARE = 0.03  # as in the default map: fewer neighbours than this is a flying pixel
 _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point may be free
 
 
-Surface = tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]
+Surface = tuple[int, Points, Values]
 
 
 def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
@@ -60,20 +58,10 @@ def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
     return found
 
 
-def off_level_set(
-    points: Float[np.ndarray, "n 3"], distance: Float32[np.ndarray, "nx ny nz"], grid: Grid
-) -> Bool[np.ndarray, " n"]:
+def off_level_set(points: Points, distance: Nodes, grid: Grid) -> Chosen:
     """Which points lie more than 4 mm off the level set, by the distance of every grid node to
     it (metres). Nearer ones are its own business: marking them would only thicken it."""
-    out = np.empty(len(points))
-
-    def look(piece: slice) -> None:
-        kernels.lower_bounds(
-            points, grid.origin, grid.spacing, distance, False, out, piece.start, piece.stop
-        )
-
-    run_chunked(look, len(points), 1 << 14)
-    return out > _OFF
+    return lower_bounds(points, grid, distance) > _OFF
 
 
 _TALLEST = 0.4  # metres above the support surface; what stands on a table is rarely taller
@@ -98,29 +86,25 @@ class Cone:
     """Where an object may be, along the rays of pixels that carry its label and no depth.
 
     Attributes:
-        object_id: the label.
-        pixels: (n, 2) row and column.
-        rays: (n, 3) world directions at depth 1.
         start, end: (n,) depths, metres.
     """
 
-    object_id: int
-    pixels: Int[np.ndarray, "n 2"]
-    rays: Float[np.ndarray, "n 3"]
-    start: Float[np.ndarray, " n"]
-    end: Float[np.ndarray, " n"]
+    object_id: int  # the label
+    pixels: Int[np.ndarray, "n 2"]  # row and column
+    rays: Points  # world directions at depth 1
+    start: Values
+    end: Values
 
 
 def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     """Return where the `lost_objects` may be, an entry for each that has more than small holes.
 
-    The cone of a pixel without a return runs from the nearest depth at which the object's
-    surface is plausible to the farthest, or to the support surface. Nearest is the farthest of:
-    the upright plane through the front of its foot, of its other points and of what is seen
-    beside its mask, moved towards the camera by half its width; the height of 40 cm; and its
-    own nearest seen surface, continued towards the camera at two metres per metre. Farthest is
-    that surface continued away from the camera. Holes of up to four pixels, as noise leaves
-    them in what was seen, have no cone.
+    The cone of a pixel without a return runs from the nearest depth at which the object's surface
+    is plausible to the farthest, or to the support surface. Nearest is the farthest of: the
+    upright plane through the front of its foot, of its other points and of what is seen beside
+    its mask, moved towards the camera by half its width; the height of 40 cm; and its own nearest
+    seen surface, continued towards the camera at two metres per metre. Farthest is that surface
+    continued away from the camera. Holes of up to four pixels, noise, have no cone.
     """
     found: list[Cone] = []
     for object_id in lost_objects(view):
@@ -148,12 +132,8 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
 
 
 def lost_points(
-    view: Observation,
-    cones: Sequence[Cone],
-    lower: Float[np.ndarray, " 3"],
-    upper: Float[np.ndarray, " 3"],
-    step: float,
-) -> Iterator[tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]]:
+    view: Observation, cones: Sequence[Cone], lower: Vector, upper: Vector, step: float
+) -> Iterator[tuple[int, Points, Values]]:
     """Yield points `step` apart along a view's `lost_cones` in a box, with the half edge of
     cubes around them that hold the cones; piece by piece, with the object's id, world, metres."""
     eye = view.camera_center
@@ -177,9 +157,7 @@ def lost_points(
             yield cone.object_id, points, 0.71 * depth / focal + 0.5 * step
 
 
-def _beside_own_surface(
-    view: Observation, depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+def _beside_own_surface(view: Observation, depth: Image, mask: Mask) -> tuple[Image, Image]:
     """Nearest and farthest depth that the object's own seen pixels allow; 0, inf without any."""
     own = mask & (depth > 0)
     if not own.any():
@@ -202,12 +180,12 @@ def _beside_own_surface(
 def _before_foot(
     view: Observation,
     plane: Plane,
-    mask: Bool[np.ndarray, "h w"],
-    lost: Bool[np.ndarray, "h w"],
+    mask: Mask,
+    lost: Mask,
     rays: Float[np.ndarray, "h w 3"],
     points: Float[np.ndarray, "h w 3"],
-    at_plane: Float[np.ndarray, "h w"],
-) -> Float[np.ndarray, "h w"]:
+    at_plane: Image,
+) -> Image:
     """Nearest depth (m) by where the object can stand and how tall it can be."""
     eye = view.camera_center
     height = float(plane.signed_distance(eye))
@@ -249,7 +227,7 @@ class SeenSupport:
     plane: Plane
     region: TableRegion
 
-    def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def signed_distance(self, points: Points) -> Values:
         """Lower bound of the distance from world points, metres, negative inside.
 
         Exact but for points beyond a corner of the hull.

@@ -10,30 +10,21 @@ SUPPORT = "support surface"
 
 @dataclass(frozen=True)
 class Source:
-    """What a kind of obstacle is called, and how it is told and drawn.
+    """What a kind of obstacle is called, and how it is told and drawn."""
 
-    Attributes:
-        kind: as in `Contact.kind`.
-        spoken: what a sentence calls it; empty for its own name.
-        color: red, green and blue in pictures; objects have one each.
-        line: style of its curves.
-        mark: on the lattice of what no object of the map accounts for, 0 for none. Where several
-            apply the largest wins.
-        policy: field of `WorldConfig` that says whether it is an obstacle; empty: it always is.
-        judged: whether the map has a say in it.
-        why: sentence that explains a contact; `{policy}` is what the policy says.
-        beyond: why the field refuses what meshes accept there.
-    """
-
-    kind: SourceKind
-    spoken: str = ""
+    kind: SourceKind  # as in `Contact.kind`
+    spoken: str = ""  # what a sentence calls it; empty for its own name
+    # red, green and blue in pictures; objects have one each
     color: tuple[float, float, float] | None = None
-    line: str = "-"
+    line: str = "-"  # style of its curves
+    # on the lattice of what no object of the map accounts for, 0 for none. Where several apply
+    # the largest wins
     mark: int = 0
+    # field of `WorldConfig` that says whether it is an obstacle; empty: it always is
     policy: str = ""
-    judged: bool = True
-    why: str = ""
-    beyond: str = ""
+    judged: bool = True  # whether the map has a say in it
+    why: str = ""  # sentence that explains a contact; `{policy}` is what the policy says
+    beyond: str = ""  # why the field refuses what meshes accept there
 
     def reason(self, config: Any) -> str:
         """Return why it is an obstacle by a `WorldConfig`; empty where its name says so."""

@@ -20,13 +20,24 @@ from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points
 from vprism_plan.world.config import WorldConfig
-from vprism_plan.world.grid import window
+from vprism_plan.world.grid import (
+    Balls,
+    Chosen,
+    Image,
+    Mask,
+    Points,
+    Shape3,
+    Slices,
+    Values,
+    Vector,
+    window,
+)
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
 _NEAR = 0.1
 
 
-def free_balls(observations: Iterable[Observation]) -> Float[np.ndarray, "s 4"]:
+def free_balls(observations: Iterable[Observation]) -> Balls:
     """Balls (world, metres) in which there was nothing but the pictured robot."""
     found = [np.empty((0, 4))]
     for observation in observations:
@@ -37,9 +48,7 @@ def free_balls(observations: Iterable[Observation]) -> Float[np.ndarray, "s 4"]:
     return np.concatenate(found)
 
 
-def speaking_against(
-    observation: Observation, things: Bool[np.ndarray, "h w"], balls: Float[np.ndarray, "s 4"]
-) -> Float[np.ndarray, "h w"]:
+def speaking_against(observation: Observation, things: Mask, balls: Balls) -> Image:
     """Depth (metres) of the pixels behind which the balls are not believed, inf elsewhere: what
     of the things (neither robot nor support surface) shows something within 10 cm of a ball of
     any view, and all that shows the same object."""
@@ -55,11 +64,8 @@ def speaking_against(
 
 
 def cells_within(
-    balls: Float[np.ndarray, "s 4"],
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    shape: tuple[int, int, int],
-) -> tuple[tuple[slice, slice, slice], Bool[np.ndarray, "x y z"]]:
+    balls: Balls, origin: Vector, spacing: float, shape: Shape3
+) -> tuple[Slices, Bool[np.ndarray, "x y z"]]:
     """Part of a lattice around the balls, and its cells that lie wholly in one of them."""
     low = np.floor(((balls[:, :3] - balls[:, 3:]).min(axis=0) - origin) / spacing)
     high = np.ceil(((balls[:, :3] + balls[:, 3:]).max(axis=0) - origin) / spacing)
@@ -82,25 +88,18 @@ THIN = 0.003
 
 @dataclass(frozen=True)
 class View:
-    """One depth image, ready to be asked what it says of a cell.
+    """One depth image, ready to be asked what it says of a cell."""
 
-    Attributes:
-        camera: (3, 4) world to camera.
-        optics: fx, fy, cx, cy, pixels.
-        reach: (levels, H, W) sparse tables: entry (k, v, u) is the minimum over the
-            2^k x 2^k window that begins at (v, u) of depth plus tolerance; infinite
-            where there is no return or the support plane was seen.
-        holes: the same, 0 where there is no return and 1 elsewhere.
-        robot: (S, 4) balls that held the robot, world, metres: nothing else is there ...
-        against: ... but behind what this view shows in or near any view's balls: like `reach`,
-            infinite elsewhere. None if there is nothing of the kind.
-    """
-
-    camera: Float[np.ndarray, "3 4"]
-    optics: Float[np.ndarray, " 4"]
+    camera: Float[np.ndarray, "3 4"]  # world to camera
+    optics: Float[np.ndarray, " 4"]  # fx, fy, cx, cy, pixels
+    # sparse tables: entry (k, v, u) is the minimum over the 2^k x 2^k window that begins at (v,
+    # u) of depth plus tolerance; infinite where there is no return or the support plane was seen
     reach: Float32[np.ndarray, "levels h w"]
-    holes: Float32[np.ndarray, "levels h w"]
-    robot: Float[np.ndarray, "s 4"] = field(default_factory=lambda: np.empty((0, 4)))
+    holes: Float32[np.ndarray, "levels h w"]  # the same, 0 where there is no return and 1 elsewhere
+    # balls that held the robot, world, metres: nothing else is there
+    robot: Balls = field(default_factory=lambda: np.empty((0, 4)))
+    # ... but behind what this view shows in or near any view's balls: like `reach`, infinite
+    # elsewhere. None if there is nothing of the kind
     against: Float32[np.ndarray, "levels h w"] | None = None
 
 
@@ -131,7 +130,7 @@ def make_view(
     observation: Observation,
     tolerance: float,
     plane: Plane | None = None,
-    robots: Float[np.ndarray, "s 4"] | None = None,
+    robots: Balls | None = None,
 ) -> View:
     """Prepare an observation; `tolerance` (metres) is how far behind a return shadow begins.
 
@@ -161,9 +160,7 @@ def make_view(
     return replace(view, robot=own, against=tables)
 
 
-def _view(
-    observation: Observation, reach: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"]
-) -> View:
+def _view(observation: Observation, reach: Image, valid: Mask) -> View:
     K, rotation = observation.intrinsics, observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
     return View(
@@ -174,7 +171,7 @@ def _view(
     )
 
 
-def shadow_behind(observation: Observation, start: Float[np.ndarray, "h w"]) -> View:
+def shadow_behind(observation: Observation, start: Image) -> View:
     """A view by which exactly what lies behind the depth `start` (metres, inf for nothing) of a
     pixel is hidden."""
     return _view(observation, start, np.ones(start.shape, dtype=bool))
@@ -184,9 +181,9 @@ def classify_cells_around(
     views: Sequence[View],
     below: Sequence[View],
     plane: Plane,
-    origin: Float[np.ndarray, " 3"],
+    origin: Vector,
     spacing: float,
-    shape: tuple[int, int, int],
+    shape: Shape3,
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """`classify_cells` for a support plane that ends somewhere: above it as `views` say, for
     which it casts no shadow; below, wherever a cell reaches there, as the `below` views say, for
@@ -203,18 +200,14 @@ def classify_cells_around(
 
 
 def classify_cells(
-    views: Sequence[View],
-    plane: Plane | None,
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    shape: tuple[int, int, int],
+    views: Sequence[View], plane: Plane | None, origin: Vector, spacing: float, shape: Shape3
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """Status of every cell of a lattice: FREE, OCCLUDED, PARTLY or UNOBSERVED (`kernels`).
 
-    Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that
-    sees a cell outweighs any number that do not. Cells wholly under the support plane
-    are called FREE: the half-space answers for them. So are cells wholly in a ball of the
-    robot in any view, where no view shows something else before them (`pictured`).
+    Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that sees a cell
+    outweighs any number that do not. Cells wholly under the support plane are called FREE: the
+    half-space answers for them. So are cells wholly in a ball of the robot in any view, where no
+    view shows something else before them.
     """
     status = np.full(shape, kernels.UNOBSERVED, dtype=np.uint8)
     blocks = -(-shape[0] // _BLOCK)
@@ -240,16 +233,13 @@ def classify_cells(
     return status
 
 
-def robot_balls(views: Sequence[View]) -> Float[np.ndarray, "s 4"]:
+def robot_balls(views: Sequence[View]) -> Balls:
     """Balls of the robots in all views."""
     return np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
 
 
 def _clear_robots(
-    views: Sequence[View],
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    status: UInt8[np.ndarray, "nx ny nz"],
+    views: Sequence[View], origin: Vector, spacing: float, status: UInt8[np.ndarray, "nx ny nz"]
 ) -> None:
     """Call the cells free in which a pictured robot was."""
     balls = robot_balls(views)
@@ -272,9 +262,7 @@ def _clear_robots(
     part[robot] = kernels.FREE
 
 
-def classify_points(
-    views: Sequence[View], points: Float[np.ndarray, "n 3"]
-) -> UInt8[np.ndarray, " n"]:
+def classify_points(views: Sequence[View], points: Points) -> UInt8[np.ndarray, " n"]:
     """Status of every point: SEEN, OCCLUDED or UNOBSERVED; SEEN also where the robot was."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     status = np.full(len(points), kernels.UNOBSERVED, dtype=np.uint8)
@@ -297,9 +285,7 @@ def classify_points(
     return _OF_POINT[status]
 
 
-def beside(
-    points: Float[np.ndarray, "n 3"], dense: Bool[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def beside(points: Points, dense: Chosen) -> Chosen:
     """Which points (m) are dense, or within half a block of one that is."""
     if dense.all() or not dense.any():
         return dense
@@ -313,7 +299,7 @@ def clutter_pixels(
     height: float,
     lone_share: float = 0.0,
     bounded: bool = False,
-) -> Bool[np.ndarray, "h w"]:
+) -> Mask:
     """Which pixels show unlabelled things off the support plane.
 
     "Off" is `height` metres, or three standard deviations of the depth noise along the normal,
@@ -350,7 +336,7 @@ def background_points(
     height: float,
     lone_share: float = 0.0,
     bounded: bool = False,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+) -> tuple[Points, Values]:
     """Points of the `clutter_pixels`, and half the width of their pixels, metres."""
     kept, widths = [np.empty((0, 3))], [np.empty(0)]
     for view in views:
@@ -361,9 +347,7 @@ def background_points(
     return np.concatenate(kept), np.concatenate(widths)
 
 
-def clutter_depth(
-    view: Observation, plane: Plane | None, config: WorldConfig
-) -> Float[np.ndarray, "h w"]:
+def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
     """Depth (metres) from which unlabelled clutter hides what is behind it, inf elsewhere."""
     bounded = config.support == "seen"
     chosen = clutter_pixels(view, plane, config.background_height, config.lone_share, bounded)

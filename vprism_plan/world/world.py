@@ -13,13 +13,7 @@ from jaxtyping import Float, UInt8
 
 from vprism_plan.errors import WorldError
 from vprism_plan.world import visibility
-from vprism_plan.world.config import (
-    HalfSpace,
-    KnownMesh,
-    OccludedPolicy,
-    Primitive,
-    WorldConfig,
-)
+from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, Primitive, WorldConfig
 from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
@@ -32,12 +26,8 @@ from vprism_plan.world.distance import (
     finish,
     round_down,
 )
-from vprism_plan.world.grid import Grid, choose_grid, grid_beyond
-from vprism_plan.world.levelset import (
-    lattice_refinement,
-    rasterize_level_set,
-    trace_level_set,
-)
+from vprism_plan.world.grid import Grid, Points, Vector, choose_grid, grid_beyond
+from vprism_plan.world.levelset import lattice_refinement, rasterize_level_set, trace_level_set
 from vprism_plan.world.marks import CELLS, Evidence, only, rasterize_mesh, unmark
 from vprism_plan.world.posterior_worlds import PosteriorWorlds, classes_of
 from vprism_plan.world.seen import RIM, seen_support
@@ -69,8 +59,6 @@ class World:
         config: resolution, level, policies and known geometry.
 
     Attributes:
-        map: the map.
-        config: the configuration.
         grid: nodes of the field.
         field: distance to objects, background, occluded or unobserved space (by policy)
             and known geometry.
@@ -262,13 +250,8 @@ class World:
     # --- queries ---------------------------------------------------------------
 
     def object_field(self, object_id: int) -> DistanceField:
-        """Distance to one object alone: where P(occupied) >= level and it is the likeliest.
-
-        Which object a point belongs to is resolved to half the grid's resolution.
-
-        Raises:
-            WorldError: the map has no such object.
-        """
+        """Distance to one object alone: where P(occupied) >= level and it is the likeliest, to
+        half the grid's resolution; WorldError if the map has none."""
         (k,) = classes_of(self.map, [object_id])
         key = ("only", frozenset([k]))
         if key not in self._cache:
@@ -279,11 +262,8 @@ class World:
     def fields_without(self, object_ids: Collection[int]) -> DistanceField:
         """Return the combined field without some objects, for contacts that are allowed.
 
-        Occluded space inside the left-out objects' level set goes with them; occluded
-        space beyond it stays, as do all other sources.
-
-        Raises:
-            WorldError: the map has no such object.
+        Occluded space inside the left-out objects' level set goes with them; occluded space
+        beyond it stays, as do all other sources. WorldError if the map has no such object.
         """
         gone = frozenset(classes_of(self.map, object_ids))
         if not gone:
@@ -305,10 +285,7 @@ class World:
         (unless the policy is "free"). The rest is for `posterior_worlds` to say; with
         `level_set`, the objects where P(occupied) >= level belong to it as well. The
         objects `without`, and their seen parts, are left out. With `seen`, so does whatever
-        was seen of an object, wherever the level set is.
-
-        Raises:
-            WorldError: the map has no such object.
+        was seen of an object, wherever the level set is. WorldError if the map has no such object.
         """
         gone = frozenset(classes_of(self.map, without))
         key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
@@ -334,15 +311,12 @@ class World:
         metres away. An object's own field holds its level set and its seen surfaces off it.
 
         Args:
-            name: one of `sources`.
+            name: one of `sources`, or WorldError.
             without: objects whose part of the occluded space, and of cells they share with this
                 obstacle, is left out, as `fields_without` does; nothing is, of their own.
 
         Returns:
             The field; its `source` is -1 everywhere if there is no such obstacle.
-
-        Raises:
-            WorldError: the world has no such source, or the map no such object.
         """
         if name not in self.sources:
             raise WorldError(f"no source {name!r} in this world; it has {', '.join(self.sources)}")
@@ -388,16 +362,8 @@ class World:
     def posterior_worlds(
         self, n_worlds: int = 256, seed: int = 0, reach: float = 0.2
     ) -> PosteriorWorlds:
-        """Return joint draws of the map on voxels of this world's resolution; kept and shared.
-
-        Args:
-            n_worlds: number of draws, a multiple of 64.
-            seed: of the draws.
-            reach: see `PosteriorWorlds`; draws with at least this reach are used again.
-
-        Raises:
-            WorldError: see `PosteriorWorlds`.
-        """
+        """Return joint draws of the map on voxels of this world's resolution, as
+        `PosteriorWorlds` does; those with at least this reach are kept and shared."""
         kept = self._draws.get((n_worlds, seed))
         if kept is None or kept.reach < reach:
             kept = PosteriorWorlds(self.map, n_worlds, seed, self.config.resolution, reach)
@@ -413,15 +379,12 @@ class World:
     def _rest(self, gone: Collection[int]) -> set[int]:
         return set(range(1, len(self.map.object_ids) + 1)) - set(gone)
 
-    def status(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    def status(self, points: Points) -> UInt8[np.ndarray, " n"]:
         """What the cameras know of each world point, whatever the policies say.
 
         0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or
         under the support surface. 2 (unobserved): outside every image, or no depth
-        return. 3: outside the grid and what was judged around it.
-
-        Raises:
-            WorldError: a point is not finite.
+        return. 3: outside the grid and what was judged around it. WorldError if one is not finite.
         """
         points = checked_points(points)
         status = visibility.classify_points(self._evidence.views, points)
@@ -452,7 +415,7 @@ class World:
         """What is usable but odd about what this world was made of."""
         return (*getattr(self.map, "warnings", ()), *self._said)
 
-    def for_base(self, base: Float[np.ndarray, " 3"]) -> "World":
+    def for_base(self, base: Vector) -> "World":
         """Return the world for a robot whose base stands there (world, metres).
 
         This world, or with `support="auto"` and a base more than 5 cm below the support plane

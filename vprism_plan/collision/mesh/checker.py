@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from vprism_plan._arguments import number
 from vprism_plan.collision import explain
@@ -22,16 +22,12 @@ from vprism_plan.collision.config import CheckerConfig, contact_rules
 from vprism_plan.collision.mesh.comparison import PathFinding, PathOpinion, causes_between
 from vprism_plan.collision.mesh.fcl import fcl
 from vprism_plan.collision.mesh.queries import Queries
-from vprism_plan.collision.mesh.solids import (
-    LinkShapes,
-    MeshWorld,
-    PlacedSolids,
-    robot_solids,
-)
-from vprism_plan.collision.packing import Numbers, configuration, configurations
+from vprism_plan.collision.mesh.solids import LinkShapes, MeshWorld, PlacedSolids, robot_solids
+from vprism_plan.collision.packing import Configuration, Numbers, configuration, configurations
 from vprism_plan.collision.reports import Contact, MotionReport
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import Robot
+from vprism_plan.world.grid import Chosen, Values
 
 _MAX_CONFIGURATIONS = 1_000_000
 
@@ -149,14 +145,14 @@ class MeshChecker(explain.Checker):
 
     # --- configurations ----------------------------------------------------------
 
-    def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
+    def is_valid_buffer(self, q: Configuration) -> bool:
         """`is_valid` without looking at the shape: every solid keeps its distances."""
         if explain.limit_contacts(self.robot, q):
             return False
         self.placed.place(q)
         return not self._queries.collides()
 
-    def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
+    def is_valid_batch(self, Q: Numbers) -> Chosen:
         """Return `is_valid` for each row of Q."""
         return np.array([*map(self.is_valid_buffer, configurations(self.robot, Q))], dtype=bool)
 
@@ -176,11 +172,11 @@ class MeshChecker(explain.Checker):
         self.placed.place(self.robot.check_configuration(q))
         return self._queries.clearance()
 
-    def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+    def clearance_batch(self, Q: Numbers) -> Values:
         """Return `clearance` for each row of Q, metres."""
         return np.array([*map(self.clearance, configurations(self.robot, Q))], dtype=np.float64)
 
-    def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+    def self_clearance_batch(self, Q: Numbers) -> Values:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
         found = []
         for q in configurations(self.robot, Q, finite=True):
@@ -225,9 +221,7 @@ class MeshChecker(explain.Checker):
 
     # --- motions -----------------------------------------------------------------
 
-    def check_motion_buffer(
-        self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
-    ) -> bool:
+    def check_motion_buffer(self, qa: Configuration, qb: Configuration) -> bool:
         """`check_motion` without looking at shapes, at discrete configurations.
 
         Between two of them no point of the robot moves more than `step` metres. (FCL's
@@ -296,7 +290,7 @@ class MeshChecker(explain.Checker):
         )
         return replace(opinion, findings=findings)
 
-    def _fractions(self, qa: np.ndarray, qb: np.ndarray) -> Float[np.ndarray, "n"]:
+    def _fractions(self, qa: np.ndarray, qb: np.ndarray) -> Values:
         """Where to look on an edge: no point of the robot moves more than `step` in between."""
         pieces = max(1, math.ceil(self.placed.motion_bound(qb - qa) / self.step))
         if pieces > _MAX_CONFIGURATIONS:
@@ -306,9 +300,7 @@ class MeshChecker(explain.Checker):
             )
         return np.linspace(0.0, 1.0, pieces + 1)
 
-    def _between(
-        self, qa: np.ndarray, qb: np.ndarray
-    ) -> Iterator[tuple[float, Float[np.ndarray, "dof"]]]:
+    def _between(self, qa: np.ndarray, qb: np.ndarray) -> Iterator[tuple[float, Configuration]]:
         """Where to look and what is there: both ends, then each time the middles of what is
         left. Who gets an invalid end asks no further."""
         yield 0.0, qa
@@ -321,6 +313,6 @@ class MeshChecker(explain.Checker):
                 yield float(fractions[m]), qa + fractions[m] * (qb - qa)
             spans = [span for a, m, b in middles for span in ((a, m), (m, b))]
 
-    def _permitted(self, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+    def _permitted(self, q: Configuration) -> list[Contact]:
         self.placed.place(q)
         return self._queries.permitted()

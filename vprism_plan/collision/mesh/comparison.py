@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import SEEN
-from vprism_plan.collision.packing import Numbers, configurations
+from vprism_plan.collision.packing import Configuration, Numbers, configurations
 from vprism_plan.collision.reports import Contact
+from vprism_plan.world.grid import Vector
 from vprism_plan.world.sources import SOURCES, object_id, source_of
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
@@ -20,7 +20,7 @@ _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
 # one (half a cell's diagonal), its cover less than half.
 _INFLATION = 1.5
 # Kinds of causes, and what they mean.
-_WHY: dict[str, str] = {
+CAUSES: dict[str, str] = {
     # the field refuses, meshes accept
     "conservative spheres": "the link's spheres reach it, its solids do not",
     "margin": "nothing touches, but the field's checker keeps a margin",
@@ -62,7 +62,7 @@ class Cause:
 
     def text(self) -> str:
         """Return the cause as one phrase."""
-        return f"{self.link} and {self.body}: {self.kind} ({_WHY[self.kind]})"
+        return f"{self.link} and {self.body}: {self.kind} ({CAUSES[self.kind]})"
 
 
 @dataclass(frozen=True)
@@ -212,9 +212,7 @@ def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
     return Comparison(both, neither, tuple(found))
 
 
-def causes_between(
-    checker: Any, mesh_checker: Any, q: Float[np.ndarray, "dof"]
-) -> tuple[Cause, ...]:
+def causes_between(checker: Any, mesh_checker: Any, q: Configuration) -> tuple[Cause, ...]:
     """Name why the two disagree on q; "edge tolerance" if both refuse it, empty if none does."""
     by_field = checker.explain(q)
     touching = mesh_checker.contacts(q)
@@ -228,7 +226,7 @@ def causes_between(
 # --- the field refuses, meshes accept ------------------------------------------------
 
 
-def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
+def _of_field(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> Cause:
     amount = contact.depth
     if contact.body in SOURCES and SOURCES[contact.body].beyond:
         kind = contact.body
@@ -249,9 +247,7 @@ def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, 
     return Cause(kind, contact.link, contact.body, float(amount))
 
 
-def _of_surface(
-    checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]
-) -> tuple[str, float]:
+def _of_surface(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> tuple[str, float]:
     """Cause and amount where the field refuses a sphere for an object or known geometry."""
     margin = float(checker.config.margin)
     center = meshes.robot.sphere_centers(q)[contact.sphere]
@@ -271,7 +267,7 @@ def _of_surface(
     return "voxel inflation" if gap <= within else "unexplained", gap
 
 
-def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named: str) -> float:
+def _ball_gap(meshes: Any, center: Vector, radius: float, named: str) -> float:
     """Signed distance of a ball to the surfaces of the kind that a contact names.
 
     For an object: to any of them, since the field names the nearest to a grid node.
@@ -294,7 +290,7 @@ def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named:
     return best
 
 
-def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: float) -> bool:
+def _level_set_refuses(checker: Any, center: Vector, radius: float) -> bool:
     """Whether the objects' level sets alone, without thin seen parts, refuse a sphere."""
     world = checker.world
     nearest = min(
@@ -306,7 +302,7 @@ def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: flo
 # --- meshes refuse, the field accepts ------------------------------------------------
 
 
-def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
+def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> Cause:
     kind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
@@ -346,9 +342,7 @@ def _field_allows(checker: Any, contact: Contact) -> bool:
     )
 
 
-def _in_spheres(
-    meshes: Any, q: Float[np.ndarray, "dof"], links: tuple[str, ...], contact: Contact
-) -> bool:
+def _in_spheres(meshes: Any, q: Configuration, links: tuple[str, ...], contact: Contact) -> bool:
     """Whether the collision spheres of each link are as near to the place of a contact as the
     solids are, to FCL's tolerance."""
     point, apart = np.array(contact.position), max(0.0, contact.required - contact.depth)

@@ -15,6 +15,7 @@ from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import HiddenSpace, SeenPoints
 from vprism_plan.collision.mesh.solids import MeshWorld, PlacedSolids
 from vprism_plan.collision.reports import Contact
+from vprism_plan.world.grid import Chosen, Values, Vector
 from vprism_plan.world.sources import source_of
 from vprism_plan.world.visibility import UNSEEN
 
@@ -151,7 +152,7 @@ class Queries:
         owner[moving] = self.surfaces.object_at(self.placed.witnesses[moving])
         return owner
 
-    def _swallowed(self, near: Bool[np.ndarray, "n b"]) -> Bool[np.ndarray, "n"]:
+    def _swallowed(self, near: Bool[np.ndarray, "n b"]) -> Chosen:
         """Solids whose witness point lies inside an object they may not touch."""
         inside = np.zeros(len(self.solids), dtype=bool)
         rows = np.flatnonzero(near.any(axis=1))
@@ -191,7 +192,7 @@ class Queries:
             True for i in points.near(need) for _ in points.inside(i, float(need[i]))
         )
 
-    def _unseen(self, margin: float) -> Iterator[tuple[int, str, Float[np.ndarray, "3"]]]:
+    def _unseen(self, margin: float) -> Iterator[tuple[int, str, Vector]]:
         """Solid, body and place of the samples of the robot's surface that are hidden."""
         if self._hidden is None:
             return
@@ -231,7 +232,7 @@ class Queries:
                 yield self._contact(i, name, (float(gaps[i]), point, plane[:3]), self._need[i])
 
     def _body_contacts(
-        self, near: Bool[np.ndarray, "n b"], need: Float[np.ndarray, "n"], detail: str = ""
+        self, near: Bool[np.ndarray, "n b"], need: Values, detail: str = ""
     ) -> Iterator[Contact]:
         owner = self._owners()
         for row, column in np.argwhere(near):

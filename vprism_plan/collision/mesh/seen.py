@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
+from vprism_plan.world.grid import Chosen, Points, Values
 from vprism_plan.world.seen import lost_cones, lost_points, surface_points
 
 SEEN = "a camera saw it there"  # the detail of contacts with observed points
@@ -64,7 +65,7 @@ class SeenPoints:
         self._tree = cKDTree(self.points)
         self._widest = float(np.max(self.half, initial=0.0))
 
-    def near(self, need: Float[np.ndarray, "n"]) -> list[int]:
+    def near(self, need: Values) -> list[int]:
         """Moving solids whose balls come within `need` (metres) of any point."""
         placed, reach = self._placed, self._placed.radii + need + self._widest
         most = float(np.max(reach[placed.moving], initial=0.0))
@@ -127,7 +128,7 @@ class HiddenSpace:
     What lies between the points is not noticed.
     """
 
-    def __init__(self, world: Any, placed: PlacedSolids, padding: Float[np.ndarray, "n"]) -> None:
+    def __init__(self, world: Any, placed: PlacedSolids, padding: Values) -> None:
         map_, config = world.map, world.config
         self._map, self._config, self._placed = map_, config, placed
         self._plane = map_.plane
@@ -150,9 +151,7 @@ class HiddenSpace:
         self._solid, self._samples, self._outward = _samples(placed)
         self._samples += padding[self._solid, None] * self._outward
 
-    def find(
-        self, margin: float
-    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    def find(self, margin: float) -> tuple[Int[np.ndarray, "n"], Points, Int[np.ndarray, "n"]]:
         """Samples of the placed robot that are hidden once they are moved outward by a margin:
         their solids, places (world, metres) and codes (`visibility.OCCLUDED` or `UNOBSERVED`)."""
         if self._idle or len(self._samples) == 0:
@@ -163,7 +162,7 @@ class HiddenSpace:
         hit = np.flatnonzero(codes)
         return self._solid[hit], points[hit], codes[hit]
 
-    def codes(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    def codes(self, points: Points) -> Int[np.ndarray, "n"]:
         """OCCLUDED or UNOBSERVED for each point (world) that the policies refuse, else 0."""
         config = self._config
         under = np.zeros(len(points), dtype=bool)
@@ -192,9 +191,7 @@ class HiddenSpace:
             codes[under] = 0  # the half-space answers there
         return codes
 
-    def _leave_to_posterior(
-        self, points: Float[np.ndarray, "n 3"], hidden: Bool[np.ndarray, "n"]
-    ) -> None:
+    def _leave_to_posterior(self, points: Points, hidden: Chosen) -> None:
         """Call what the map has support for not hidden, unless clutter hides it.
 
         Half the support is enough here: the world asks at the middle of a cell.

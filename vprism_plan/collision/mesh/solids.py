@@ -12,11 +12,12 @@ from jaxtyping import Float, Int
 
 from vprism_plan._arguments import choice
 from vprism_plan.collision.mesh.fcl import Shape, point_distance, point_within
-from vprism_plan.collision.packing import reach_table
+from vprism_plan.collision.packing import Configuration, reach_table
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.robots import PrimitiveGeometry, Robot
 from vprism_plan.robots.kinematics import KIND_REVOLUTE
 from vprism_plan.world.config import Box, Cylinder, KnownMesh, Sphere
+from vprism_plan.world.grid import Points, Values, Vector
 from vprism_plan.world.levelset import lattice_refinement
 from vprism_plan.world.marks import winding_number
 from vprism_plan.world.meshes import extract_refined_meshes
@@ -29,42 +30,28 @@ _MOST_PIECES = 20
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """One shape of a link, as large as the URDF has it.
+    """One shape of a link, as large as the URDF has it."""
 
-    Attributes:
-        link: index into `robot.link_names`.
-        sphere: index of the collision sphere it is, or -1.
-        shape: what FCL is asked about.
-        T_link: (4, 4) pose in the link's frame.
-        center: (3,) centre of a ball that holds it, link frame, metres.
-        radius: of that ball, metres.
-        witness: (3,) a point of the shape, link frame: the shape is connected, so where
-            no surface cuts it this point tells which side all of it is on.
-        primitive: the shape as a formula; None for meshes.
-        vertices: (v, 3) of a mesh, link frame; None for primitives.
-        closed: whether it is a closed mesh, whose inside counts.
-        hull: (f, 4) half-spaces n . x + d <= 0 around a mesh, link frame.
-        triangles: (f, 3, 3) of its surface, link frame.
-    """
+    link: int  # index into `robot.link_names`
+    sphere: int  # index of the collision sphere it is, or -1
+    shape: Shape  # what FCL is asked about
+    T_link: Float[np.ndarray, "4 4"]  # pose in the link's frame
+    center: Vector  # centre of a ball that holds it, link frame, metres
+    radius: float  # of that ball, metres
+    # a point of the shape, link frame: the shape is connected, so where no surface cuts it this
+    # point tells which side all of it is on
+    witness: Vector
+    triangles: Float[np.ndarray, "f 3 3"]  # of its surface, link frame
+    primitive: PrimitiveGeometry | None = None  # the shape as a formula; None for meshes
+    vertices: np.ndarray | None = None  # of a mesh, link frame; None for primitives
+    closed: bool = False  # whether it is a closed mesh, whose inside counts
+    hull: np.ndarray | None = None  # half-spaces n . x + d <= 0 around a mesh, link frame
 
-    link: int
-    sphere: int
-    shape: Shape
-    T_link: Float[np.ndarray, "4 4"]
-    center: Float[np.ndarray, "3"]
-    radius: float
-    witness: Float[np.ndarray, "3"]
-    triangles: Float[np.ndarray, "f 3 3"]
-    primitive: PrimitiveGeometry | None = None
-    vertices: np.ndarray | None = None
-    closed: bool = False
-    hull: np.ndarray | None = None
-
-    def holds(self, point: Float[np.ndarray, "3"]) -> bool:
+    def holds(self, point: Vector) -> bool:
         """Whether a point (link frame) is inside a closed mesh."""
         return self.closed and abs(winding_number(point, self.triangles)) > 0.5
 
-    def bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def bound(self, points: Points) -> Values:
         """Lower bound of the signed distance of points (link frame), metres; exact for
         primitives."""
         if self.primitive is not None:
@@ -168,7 +155,7 @@ def _piece(link: int, piece: Any) -> Solid:
     return Solid(link, -1, shape, np.eye(4), center, radius, points[0], triangles, **own)
 
 
-def _hull(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "f 4"]:
+def _hull(points: Points) -> Float[np.ndarray, "f 4"]:
     """Half-spaces around points: of their convex hull, or of their box if they are flat."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -211,7 +198,7 @@ class PlacedSolids:
         self.R = self.t = self.centers = self.witnesses = np.empty(0)
         self._link_poses = np.empty(0)
 
-    def place(self, q: Float[np.ndarray, "dof"]) -> None:
+    def place(self, q: Configuration) -> None:
         """Compute all poses; shapes are moved one by one, when they are asked about."""
         poses = self.robot.link_poses(q)
         self._link_poses = np.array([poses[name] for name in self._names])
@@ -227,14 +214,12 @@ class PlacedSolids:
         shape.place(self.R[i], self.t[i])
         return shape
 
-    def to_link(self, i: int, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def to_link(self, i: int, points: Points) -> Points:
         """Express world points in the frame of a solid's link."""
         T = self._link_poses[self._row[i]]
         return (points - T[:3, 3]) @ T[:3, :3]
 
-    def from_links(
-        self, solids: Int[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def from_links(self, solids: Int[np.ndarray, "n"], points: Points) -> Points:
         """World positions of points in the frames of the links of some solids, given link by
         link."""
         rows = self._row[solids]
@@ -246,9 +231,7 @@ class PlacedSolids:
                 parts.append(points[a:b] @ T[:3, :3].T + T[:3, 3])
         return np.concatenate(parts)
 
-    def points_within(
-        self, i: int, points: Float[np.ndarray, "n 3"], reach: Float[np.ndarray, "n"]
-    ) -> Iterator[int]:
+    def points_within(self, i: int, points: Points, reach: Values) -> Iterator[int]:
         """Rows of points (world) that lie in a solid, or within `reach` (metres) of it; those
         that seem deepest first."""
         solid, local = self.solids[i], self.to_link(i, points)
@@ -263,7 +246,7 @@ class PlacedSolids:
             if point_within(shape, points[row], float(reach[row])) or solid.holds(local[row]):
                 yield row
 
-    def point_gap(self, i: int, point: Float[np.ndarray, "3"]) -> float:
+    def point_gap(self, i: int, point: Vector) -> float:
         """Signed distance from a solid to a point (world), metres; exact."""
         solid, local = self.solids[i], self.to_link(i, point[None])[0]
         if solid.primitive is not None:
@@ -271,7 +254,7 @@ class PlacedSolids:
         way, _ = point_distance(self.shape(i), point)
         return -way if solid.holds(local) else way
 
-    def plane_gaps(self, plane: Float[np.ndarray, "4"]) -> Float[np.ndarray, "n"]:
+    def plane_gaps(self, plane: Float[np.ndarray, "4"]) -> Values:
         """Signed distance from each solid to the half-space {x : n . x < offset}, exact, metres."""
         normal = plane[:3]
         local = np.abs(np.einsum("nij,i->nj", self.R, normal))  # in each solid's frame
@@ -282,7 +265,7 @@ class PlacedSolids:
             gaps[i] = self.lowest_point(int(i), normal) @ normal - plane[3]
         return gaps
 
-    def lowest_point(self, i: int, normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    def lowest_point(self, i: int, normal: Vector) -> Vector:
         """World point of a solid that lies farthest against a direction."""
         solid = self.solids[i]
         if solid.vertices is not None:
@@ -303,7 +286,7 @@ class PlacedSolids:
         rows = list(itertools.chain.from_iterable(pairs))
         return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
-    def motion_bound(self, delta: Float[np.ndarray, "dof"]) -> float:
+    def motion_bound(self, delta: Configuration) -> float:
         """Bound the way of any point of any solid while the joints change by `delta`, metres."""
         return float(np.max(np.abs(delta) @ self._levers, initial=0.0))
 
@@ -336,28 +319,19 @@ _DEEP = 5.0  # metres: what is under a surface that ends reaches down farther th
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One obstacle with a surface.
+    """One obstacle with a surface."""
 
-    Attributes:
-        name: "object:3" or "known:NAME".
-        class_index: class of the map (1..C), 0 for known geometry.
-        shape: what FCL is asked about, at its place in the world.
-        lower: lower corner of its box, world axes, metres.
-        upper: upper corner.
-        witnesses: (w, 3) one point of each connected piece of the surface, world.
-        closed: (f, 3, 3) triangles of a closed mesh whose inside counts; None for objects
-            (their inside is the map's to say), primitives (solid to FCL) and open meshes.
-    """
-
-    name: str
-    class_index: int
-    shape: Shape
-    lower: Float[np.ndarray, "3"]
-    upper: Float[np.ndarray, "3"]
-    witnesses: Float[np.ndarray, "w 3"]
+    name: str  # "object:3" or "known:NAME"
+    class_index: int  # class of the map (1..C), 0 for known geometry
+    shape: Shape  # what FCL is asked about, at its place in the world
+    lower: Vector  # lower corner of its box, world axes, metres
+    upper: Vector  # upper corner
+    witnesses: Float[np.ndarray, "w 3"]  # one point of each connected piece of the surface, world
+    # triangles of a closed mesh whose inside counts; None for objects (their inside is the map's
+    # to say), primitives (solid to FCL) and open meshes
     closed: np.ndarray | None = None
 
-    def contains(self, point: Float[np.ndarray, "3"]) -> bool:
+    def contains(self, point: Vector) -> bool:
         """Whether a point is inside a closed known mesh."""
         if self.closed is None or ((point < self.lower) | (point > self.upper)).any():
             return False
@@ -396,14 +370,14 @@ class MeshWorld:
         self.lower = np.array([body.lower for body in self.bodies]).reshape(-1, 3)
         self.upper = np.array([body.upper for body in self.bodies]).reshape(-1, 3)
 
-    def box_distances(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n b"]:
+    def box_distances(self, points: Points) -> Float[np.ndarray, "n b"]:
         """Distance from points to the boxes of the bodies, metres: never above that to them."""
         below = self.lower - points[:, None]
         above = points[:, None] - self.upper
         out = np.maximum(np.maximum(below, above), 0.0)
         return np.sqrt(np.einsum("nbi,nbi->nb", out, out))
 
-    def object_at(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    def object_at(self, points: Points) -> Int[np.ndarray, "n"]:
         """Class (1..C) of the object that holds each point, 0 if none does.
 
         The level set decides, not the mesh: a closed surface says nothing to FCL about
