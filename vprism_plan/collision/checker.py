@@ -25,7 +25,7 @@ from vprism_plan.collision.packing import (
     waypoints,
 )
 from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate
-from vprism_plan.collision.risk import PathRisk, Setting
+from vprism_plan.collision.risk import PathRisk, Setting, make_setting
 from vprism_plan.errors import ConfigError
 from vprism_plan.world.grid import Chosen, Values
 
@@ -36,20 +36,19 @@ _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 class CollisionChecker(explain.Checker):
     """Answers whether configurations and edges of a robot are free of a world.
 
-    A configuration is valid when its joints are within their limits, every collision
-    sphere of every moving link keeps more than `config.margin` from the world, and
-    every link pair that may collide keeps more than `config.self_margin`. All
-    distances are lower bounds, so an error can only refuse. Links that no joint moves
-    are not checked against the world: they stand on it.
+    A configuration is valid when its joints are within their limits, every collision sphere of
+    every moving link keeps more than `config.margin` from the world, and every link pair that may
+    collide keeps more than `config.self_margin`. All distances are lower bounds, so an error can
+    only refuse. Links that no joint moves are not checked against the world: they stand on it.
 
     `config.allowed_contacts` lets links touch chosen objects; `config.max_risk` bounds the
-    probability of collision (see `CheckerConfig`): in place of the level set, or beside it
-    where the bound is below the world's `level`.
+    probability of collision (see `CheckerConfig`): in place of the level set, or beside it where
+    the bound is below the world's `level`.
 
-    Construction compiles the kernels if they are not cached on disk (some twenty seconds,
-    once per machine). Safe to share between threads; the kernels release the GIL.
-    Single queries cost a microsecond or two of compiled code: O(frames + links), plus
-    O(spheres) for the links whose bounding spheres come near something.
+    Construction compiles the kernels if they are not cached on disk (some twenty seconds, once per
+    machine). Safe to share between threads; the kernels release the GIL. Single queries cost a
+    microsecond or two of compiled code: O(frames + links), plus O(spheres) for the links whose
+    bounding spheres come near something.
 
     Args:
         world: What to avoid: a `vprism_plan.World`, or anything that has its `field` (origin,
@@ -94,10 +93,10 @@ class CollisionChecker(explain.Checker):
     def _within_what_was_seen(self, bound: float) -> tuple[list[Any], PackedWorld]:
         """Return what verdicts under a bound on risk go by beside the draws.
 
-        Touching a point that is occupied with at least the probability `level` breaks a bound
-        below the level by itself. The draws are counted voxel by voxel, each as the ball
-        inscribed in it: alone they let a planner shave millimetres off a surface that everybody
-        sees. Under a bound above the level the seen surfaces alone are obstacles.
+        Touching a point that is occupied with at least the probability `level` breaks a bound below
+        the level by itself. The draws are counted voxel by voxel, each as the ball inscribed in it:
+        alone they let a planner shave millimetres off a surface that everybody sees. Under a bound
+        above the level the seen surfaces alone are obstacles.
         """
         world = self._ruled_world()
         within = bound < world.config.level
@@ -138,11 +137,10 @@ class CollisionChecker(explain.Checker):
     def clearance(self, q: Numbers) -> float:
         """Return a lower bound of the distance from the robot to the world, metres.
 
-        Negative when a sphere reaches into the level set, the table, known geometry or
-        whatever else the world's policies make an obstacle. The margin is not
-        subtracted, and self-collision and joint limits do not enter. It is measured to the
-        level set also when `max_risk` decides what is valid; a link's allowed contacts do
-        not count. RobotError if q is not finite.
+        Negative when a sphere reaches into the level set, the table, known geometry or whatever
+        else the world's policies make an obstacle. The margin is not subtracted, and self-collision
+        and joint limits do not enter. It is measured to the level set also when `max_risk` decides
+        what is valid; a link's allowed contacts do not count. RobotError if q is not finite.
         """
         return float(self._clearances(configuration(self.robot, q)[None])[0][0])
 
@@ -159,9 +157,9 @@ class CollisionChecker(explain.Checker):
 
         Covered by conservative advancement on the clearances, with every link's displacement
         bounded from the kinematic chain. Where clearance is so small that the steps fall below
-        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance`
-        metres of motion. With `max_risk`, the worlds that collide anywhere on the edge must
-        be few enough, too.
+        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance` metres of
+        motion. With `max_risk`, the worlds that collide anywhere on the edge must be few enough,
+        too.
         """
         return self._check_motion(qa, qb, np.empty(4))
 
@@ -193,9 +191,9 @@ class CollisionChecker(explain.Checker):
         """Return a checker with a stricter bound on risk; None if there is no stricter one.
 
         Each edge of a path may be within `max_risk` and the path still above it. Level by level
-        fewer worlds may collide with an edge, then none, then the spheres grow by up to two
-        voxels. Everything is shared with this checker, whose verdicts include those of the
-        stricter one. ConfigError without a `max_risk`.
+        fewer worlds may collide with an edge, then none, then the spheres grow by up to two voxels.
+        Everything is shared with this checker, whose verdicts include those of the stricter one.
+        ConfigError without a `max_risk`.
         """
         if self._bounded is None:
             raise ConfigError("max_risk is None; only a bound on risk can be tightened")
@@ -292,16 +290,16 @@ class CollisionChecker(explain.Checker):
     def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
         """Return the probability that a path (or a configuration) touches anything.
 
-        The share of worlds, drawn from the map's posterior, in which any sphere of any
-        moving link touches an occupied voxel that it may not touch, or a certain obstacle,
-        anywhere on the path: the same world for the whole path. Edges are straight in joint
-        space and swept without gaps. Margin, self-collision and joint limits do not enter.
+        The share of worlds, drawn from the map's posterior, in which any sphere of any moving link
+        touches an occupied voxel that it may not touch, or a certain obstacle, anywhere on the
+        path: the same world for the whole path. Edges are straight in joint space and swept without
+        gaps. Margin, self-collision and joint limits do not enter.
 
         Args:
             path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
-            held_out: ask other worlds than those that `max_risk` is checked with. A path
-                that a planner found with this checker was selected by the worlds it was
-                checked with, so their verdict on it is too mild.
+            held_out: ask other worlds than those that `max_risk` is checked with. A path that a
+                planner found with this checker was selected by the worlds it was checked with, so
+                their verdict on it is too mild.
 
         Raises:
             RobotError: see `packing.waypoints`.
@@ -322,7 +320,9 @@ class CollisionChecker(explain.Checker):
         with self._lock:
             if self._path_risk is None:
                 self._path_risk = PathRisk(
-                    self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
+                    make_setting(
+                        self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
+                    )
                 )
             return self._path_risk
 

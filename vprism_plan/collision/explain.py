@@ -40,8 +40,8 @@ class Checker:
     """What checkers answer alike; see there for `is_valid_buffer` and `check_motion_buffer` (the
     same for contiguous float64 arrays, whatever their shape), `clearance` and `contacts`.
 
-    A configuration is (dof,) joint values, radians or metres, in the order of
-    `robot.joint_names`, a batch (n, dof); what has another shape raises RobotError.
+    A configuration is (dof,) joint values, radians or metres, in the order of `robot.joint_names`,
+    a batch (n, dof); what has another shape raises RobotError.
     """
 
     def is_valid(self: Any, q: Numbers) -> bool:
@@ -227,9 +227,9 @@ def allowed_contacts(checker: Any, q: Configuration) -> list[Contact]:
 def nearest_source(world: Any, field: Any, point: Vector) -> tuple[str, Vector]:
     """Return the name of the obstacle nearest to a point and the direction away from it.
 
-    A node at the distance d from an obstacle says that it is at most d plus the way to the
-    node from the point. The smallest such sum over the nodes around names the nearest one
-    to within a fraction of a voxel: some node lies close to the way there.
+    A node at the distance d from an obstacle says that it is at most d plus the way to the node
+    from the point. The smallest such sum over the nodes around names the nearest one to within a
+    fraction of a voxel: some node lies close to the way there.
     """
     shape = np.array(field.distance.shape)
     g = (point - field.origin) / field.spacing

@@ -28,22 +28,22 @@ class BodyMargin:
         link: the link.
         body: the obstacle, named as in `Contact.body`.
         kind: what it is.
-        clearance: lower bound of the distance between them (over all of a path), metres;
-            negative inside.
+        clearance: lower bound of the distance between them (over all of a path), metres; negative
+            inside.
         gradient: (dof,) change of the distance per radian or metre of each joint, at the
-            configuration where they are nearest, from the slope of the distance field;
-            zeros where that has none (in the middle of an obstacle).
-        nearest: point of the obstacle nearest to the sphere's centre, world, metres, to
-            within a voxel of the world's field (exact for half-spaces; rough from beyond
-            the grid). From a centre inside the obstacle: the nearest way out.
+            configuration where they are nearest, from the slope of the distance field; zeros where
+            that has none (in the middle of an obstacle).
+        nearest: point of the obstacle nearest to the sphere's centre, world, metres, to within a
+            voxel of the world's field (exact for half-spaces; rough from beyond the grid). From a
+            centre inside the obstacle: the nearest way out.
         witness: point of the link's surface nearest to it, world, metres.
         sphere: the link's collision sphere on which `witness` lies.
-        occupancy: the map's P(occupied) at `nearest`; None where the map has no say
-            (support surface, known geometry).
+        occupancy: the map's P(occupied) at `nearest`; None where the map has no say (support
+            surface, known geometry).
         entropy: the map's entropy there, nats; None likewise.
         allowed: whether a contact rule lets this link touch this object.
-        place: where on the path: number of the edge plus the fraction of it; 0 for a
-            single configuration.
+        place: where on the path: number of the edge plus the fraction of it; 0 for a single
+            configuration.
     """
 
     link: str
@@ -77,8 +77,8 @@ class SafetyMargins:
         joint_names: names of the gradients' entries.
         joint_units: their units, "rad" or "m".
         resolution: voxel of the world's field, metres: how exact `nearest` is.
-        tolerance: what was subtracted, metres, so that the bounds hold between the
-            configurations that were looked at; 0 for a single one.
+        tolerance: what was subtracted, metres, so that the bounds hold between the configurations
+            that were looked at; 0 for a single one.
         configurations: how many that were.
     """
 
@@ -163,12 +163,12 @@ class Obstacle:
         return self.field.lower_bound(points)
 
     def nearest(self, points: Points) -> tuple[Points, Points]:
-        """Nearest points of the obstacle (of what is not the obstacle, from inside it), and
-        the unit directions in which the distance grows (0 where it has no slope).
+        """Nearest points of the obstacle (of what is not the obstacle, from inside it), and the
+        unit directions in which the distance grows (0 where it has no slope).
 
-        One step down the slope of the nodes' distances, to within a voxel; from beyond the
-        grid, the nearest as seen from the grid's face. Directions are within a degree for
-        most points, a few degrees off within a voxel of an edge.
+        One step down the slope of the nodes' distances, to within a voxel; from beyond the grid,
+        the nearest as seen from the grid's face. Directions are within a degree for most points, a
+        few degrees off within a voxel of an edge.
         """
         if self.field is None:
             normal = np.tile(self.plane[:3], (len(points), 1))
@@ -221,15 +221,14 @@ def obstacles_of(world: Any, without: frozenset[int] = frozenset()) -> tuple[Obs
 def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) -> SafetyMargins:
     """Return the margin between every moving link and every obstacle.
 
-    Each obstacle is asked by itself, so what stands behind something nearer is named,
-    too. All clearances are lower bounds by the checker's own rules, and none is below
-    `checker.clearance` but by rounding. Along a path the edges are sampled so closely
-    that no sphere moves more than `tolerance` to the nearest sample, and that much is
-    subtracted; for a tight bound over everything ask `min_clearance`. Joint limits do
-    not enter.
+    Each obstacle is asked by itself, so what stands behind something nearer is named, too. All
+    clearances are lower bounds by the checker's own rules, and none is below `checker.clearance`
+    but by rounding. Along a path the edges are sampled so closely that no sphere moves more than
+    `tolerance` to the nearest sample, and that much is subtracted; for a tight bound over
+    everything ask `min_clearance`. Joint limits do not enter.
 
-    The first call bakes one distance field per obstacle (`obstacles_of`); after
-    that a configuration costs milliseconds, a path O(configurations x spheres x bodies).
+    The first call bakes one distance field per obstacle (`obstacles_of`); after that a
+    configuration costs milliseconds, a path O(configurations x spheres x bodies).
 
     Args:
         checker: a `CollisionChecker` over a `World`.
@@ -270,8 +269,8 @@ def margin_profile(
 
     Returns:
         Places on the path (number of the edge plus the fraction of it), so close that no sphere
-        moves more than the tolerance (metres) to the nearest, and for each obstacle the
-        clearance there, nothing subtracted.
+        moves more than the tolerance (metres) to the nearest, and for each obstacle the clearance
+        there, nothing subtracted.
     """
     checked_tolerance(tolerance)
     Q, places = edges_of(checker, path).samples(tolerance)

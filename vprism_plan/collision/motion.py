@@ -107,8 +107,8 @@ def sphere_jacobians(
 ) -> tuple[Points, Float[np.ndarray, "n 3 dof"]]:
     """Centres, metres, of one sphere at each configuration, and their derivatives.
 
-    The geometric Jacobian, metres per radian or metre: axis x (centre - joint) for a
-    revolute joint, the axis for a prismatic one, times the factor of joints that mimic.
+    The geometric Jacobian, metres per radian or metre: axis x (centre - joint) for a revolute
+    joint, the axis for a prismatic one, times the factor of joints that mimic.
     """
     R, t = frame_poses(arrays, Q)
     rows, frames = np.arange(len(Q)), arrays.sphere_frame[spheres]
@@ -136,10 +136,9 @@ class PathClearance:
 
     Attributes:
         clearance: lower bound of the distance to the world at every point of the path.
-        tolerance: the smallest clearance of any configuration on the path lies at most
-            this much above `clearance`.
-        place: where the smallest clearance was found: number of the edge plus the
-            fraction of it.
+        tolerance: the smallest clearance of any configuration on the path lies at most this much
+            above `clearance`.
+        place: where the smallest clearance was found: number of the edge plus the fraction of it.
         q: (dof,) that configuration; its clearance is `clearance + tolerance`.
         configurations: how many were computed.
         motion: upper bound of any sphere's way along the path.
@@ -170,13 +169,11 @@ class SafeMotion:
     """Answer of `max_safe_motion`.
 
     Attributes:
-        fraction: the motion is valid from 0 up to this fraction of dq; 0 if q itself is
-            refused.
-        refused_at: a fraction, just after, at which it is refused; None if all of it is
-            valid.
-        tolerance: metres of motion. From `fraction` to `refused_at` nothing moves more
-            than this, nor from any point before `fraction` to a configuration that was
-            found valid or is proven so by its neighbours' clearances.
+        fraction: the motion is valid from 0 up to this fraction of dq; 0 if q itself is refused.
+        refused_at: a fraction, just after, at which it is refused; None if all of it is valid.
+        tolerance: metres of motion. From `fraction` to `refused_at` nothing moves more than this,
+            nor from any point before `fraction` to a configuration that was found valid or is
+            proven so by its neighbours' clearances.
         distance: upper bound of any sphere's way up to `fraction`, metres.
         reason: why it is refused at `refused_at`; None if it is not.
         configurations: how many were checked.
@@ -212,15 +209,15 @@ class SafeMotion:
 def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> PathClearance:
     """Return a lower bound of the clearance over a whole path, and where it is smallest.
 
-    Branch and bound over intervals of edges. If no sphere can move more than m from the
-    middle of an interval to anywhere in it, the distance there is at least c - m, where
-    c is the middle's clearance: distances are 1-Lipschitz and c is a lower bound. An
-    interval is closed when that exceeds what is found elsewhere less the tolerance, or
-    when m is at most the tolerance; otherwise its halves are asked. So no configuration
-    on the path is nearer to anything than `clearance`.
+    Branch and bound over intervals of edges. If no sphere can move more than m from the middle of
+    an interval to anywhere in it, the distance there is at least c - m, where c is the middle's
+    clearance: distances are 1-Lipschitz and c is a lower bound. An interval is closed when that
+    exceeds what is found elsewhere less the tolerance, or when m is at most the tolerance;
+    otherwise its halves are asked. So no configuration on the path is nearer to anything than
+    `clearance`.
 
-    Computed clearances are bounds, which drop by up to a voxel between neighbours:
-    intervals are closed early only if they could not come in under the answer even so.
+    Computed clearances are bounds, which drop by up to a voxel between neighbours: intervals are
+    closed early only if they could not come in under the answer even so.
 
     Args:
         checker: a `CollisionChecker`.
@@ -267,11 +264,11 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
 def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.0005) -> SafeMotion:
     """Return how far from q along dq the checker's verdict stays "valid".
 
-    Conservative advancement: from a configuration with clearance c (less the margin)
-    and self gap g the motion cannot be refused before something moves by them. Where
-    they are within a voxel of what is required, or `max_risk` is set (of which no such
-    bound exists), it goes on in steps of at most `tolerance` metres of motion and asks
-    each. What is refused first is then bracketed by halving.
+    Conservative advancement: from a configuration with clearance c (less the margin) and self gap g
+    the motion cannot be refused before something moves by them. Where they are within a voxel of
+    what is required, or `max_risk` is set (of which no such bound exists), it goes on in steps of
+    at most `tolerance` metres of motion and asks each. What is refused first is then bracketed by
+    halving.
 
     Args:
         checker: a `CollisionChecker`.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Robots, worlds and joint values as the flat arrays that the checking kernels read.
 
-Besides copying, this turns every joint frame so that its axis is z (a rotation about a
-coordinate axis costs half of a general one), bounds how far each joint can carry each link,
-which is what the continuous edge check advances by, and checks joint values as people write
-them, once, before anything is computed from them.
+Besides copying, this turns every joint frame so that its axis is z (a rotation about a coordinate
+axis costs half of a general one), bounds how far each joint can carry each link, which is what the
+continuous edge check advances by, and checks joint values as people write them, once, before
+anything is computed from them.
 """
 
 from collections.abc import Sequence
@@ -227,12 +227,12 @@ def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Rows:
 
 
 def waypoints(robot: Any, path: Numbers, single: bool = False) -> Waypoints:
-    """Return the waypoints (T, dof), T >= 1, of a path whose motion can be bounded; with
-    `single`, take one configuration (dof,) for a path, too.
+    """Return the waypoints (T, dof), T >= 1, of a path whose motion can be bounded; with `single`,
+    take one configuration (dof,) for a path, too.
 
     Raises:
-        RobotError: the shape is wrong, a value is not finite or far beyond any use (angles
-            lose their last digits there), or a sliding joint leaves its limits.
+        RobotError: the shape is wrong, a value is not finite or far beyond any use (angles lose
+            their last digits there), or a sliding joint leaves its limits.
     """
     array = joint_values(path, robot, "a path")
     rows = array[None] if single and array.ndim == 1 else array

@@ -50,13 +50,12 @@ class Certain:
     that takes longer than drawing worlds, and who only counts draws never asks."""
 
     def __init__(self, world: Any, rules: Sequence[Collection[int]]) -> None:
-        self._world = world
-        self._rules = tuple(rules)
+        self._world, self.rules = world, tuple(rules)
 
     @cached_property
     def fields(self) -> list[Any]:
         """Distance to it, one field per contact rule."""
-        return [self._world.certain_field(ids) for ids in self._rules]
+        return [self._world.certain_field(ids) for ids in self.rules]
 
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,11 +96,6 @@ class Setting:
 def grown(setting: Setting, voxels: float) -> Setting:
     """Return the same for spheres larger by some voxels (smaller, if negative) in the draws."""
     return replace(setting, radii=setting.radii + voxels * setting.worlds.resolution)
-
-
-def with_margin(setting: Setting, margin: float) -> Setting:
-    """Return the same for spheres that must keep `margin` (metres) more than not touching."""
-    return replace(setting, radii=setting.radii + margin, margin=setting.margin + margin)
 
 
 def make_setting(
@@ -191,12 +185,8 @@ def count_at(at: Setting, q: Configuration) -> tuple[Float[np.ndarray, "3 s"], i
     worlds = at.worlds
     centers = np.empty((3, len(at.radii)))
     checking.place_spheres(q, at.floats, at.ints, centers)
-    tables, (scale, reach) = worlds.tables, worlds.scale
-    hits = risk.touch_one(
-        centers, at.radii, at.sphere_tables, tables.distance_row, tables.rows, tables.lowest,
-        worlds.first, worlds.resolution, scale, reach,
-        np.zeros(worlds.n_worlds, np.uint8),
-    )  # fmt: skip
+    touched = np.zeros(worlds.n_worlds, np.uint8)
+    hits = risk.touch_one(centers, at.radii, at.sphere_tables, *worlds.baked(), touched)
     if hits < 0:  # the first to ask here: bake, then count
         hits = int(_touch(at, centers[None], np.zeros((1, len(at.radii))))[1][0])
     return centers, hits
@@ -207,16 +197,13 @@ def _touch(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Touched worlds, count at each sample, first sample of each world; bakes what it needs."""
     worlds = at.worlds
-    scale, reach = worlds.scale
     while True:
-        tables = worlds.tables
         touched = np.zeros(worlds.n_worlds, np.uint8)
         counts = np.empty(len(centers), np.int64)
         first = np.full(worlds.n_worlds, -1, np.int64)
         wanted = worlds.new_marks()
         missing = risk.touch(
-            centers, slack, at.radii, at.sphere_tables, tables.distance_row, tables.rows,
-            tables.lowest, worlds.first, worlds.resolution, scale, reach,
+            centers, slack, at.radii, at.sphere_tables, *worlds.baked(),
             touched, counts, first, wanted,
         )  # fmt: skip
         if not missing:
@@ -247,26 +234,6 @@ def first_contacts(
         found[body, _link_of(at, sphere), waypoint] += count
     ranked = sorted(found.items(), key=lambda item: (-item[1], item[0]))
     return tuple(FirstContact(*cause, count / total) for cause, count in ranked if count > 0)
-
-
-def risky_contacts(at: Setting, sweep: Sweep, upper: float) -> tuple[Contact, ...]:
-    """Which links touch which objects in how many worlds, the most frequent first. Each world
-    counts for its deepest contact alone: the shares add up to the probability of collision, whose
-    upper bound is given."""
-    bound = at.config.max_risk
-    return tuple(
-        Contact(
-            kind="risk",
-            link=_link_of(at, sphere),
-            body=body,
-            depth=upper - float(bound or 0.0),
-            sphere=sphere,
-            position=as_point(sweep.centers[0, :, sphere]),
-            probability=count / at.worlds.n_worlds,
-            detail=f"upper bound of all {upper:.3f}, max_risk {bound}",
-        )
-        for (sphere, body, _), count in _touching(at, sweep, sweep.first).most_common()
-    )
 
 
 def _link_of(at: Setting, sphere: int) -> str:
@@ -311,32 +278,22 @@ def _certain_cause(at: Setting, path: Waypoints, edge: int, fraction: float) -> 
 
 
 class PathRisk:
-    """A robot among the posterior worlds of one map; see `make_setting` for the arguments.
+    """Verdicts on and estimates of a robot among the posterior worlds of one map; `allowed` is
+    how many may collide with what is valid, under `config.max_risk`."""
 
-    Attributes:
-        allowed: how many worlds may collide with what is valid, under `config.max_risk`.
-    """
-
-    def __init__(
-        self,
-        world: Any,
-        robot: Any,
-        config: CheckerConfig,
-        rules: Sequence[Collection[int]],
-        link_rules: Int[np.ndarray, " l"],
-    ) -> None:
+    def __init__(self, setting: Setting) -> None:
         # Probabilities are of touching; verdicts keep the margin as well, and touch a voxel
         # at its corners.
-        self.setting = make_setting(world, robot, config, rules, link_rules)
-        self._corners = grown(self.setting, CORNER)
-        self._kept = grown(with_margin(self.setting, config.margin), CORNER)
-        worlds = self.setting.worlds
+        self.setting, config, rules = setting, setting.config, setting.certain.rules
+        self._corners = grown(setting, CORNER)
+        kept = replace(setting, radii=setting.radii + config.margin, margin=config.margin)
+        self._kept = grown(kept, CORNER)
+        worlds = setting.worlds
         lower, upper = clopper_pearson(config.n_worlds, config.confidence)
         self._lower = np.maximum(lower - worlds.error_occupied, 0.0)
         # Where something may be touched, a voxel said to be its own may hide another object.
         hidden = worlds.error_free + (worlds.error_occupied if any(rules) else 0.0)
         self._upper = np.minimum(upper + hidden, 1.0)
-        self._codes: SpaceCodes | None = None
         self._held_out: PathRisk | None = None
         self.allowed = 0
         if config.max_risk is not None:
@@ -387,9 +344,24 @@ class PathRisk:
         return float(first[self.allowed]) / max(1, len(sweep.counts) - 1)
 
     def contacts(self, q: Configuration) -> tuple[Contact, ...]:
-        """Return which links touch which objects in how many worlds, the most frequent first."""
-        sweep = count_path(self._kept, q[None])
-        return risky_contacts(self._kept, sweep, float(self._upper[int(sweep.touched.sum())]))
+        """Return which links touch which objects in how many worlds, the most frequent first.
+        Each world counts for its deepest contact alone: the shares add up to the probability of
+        collision."""
+        at, sweep = self._kept, count_path(self._kept, q[None])
+        bound, upper = at.config.max_risk, float(self._upper[int(sweep.touched.sum())])
+        return tuple(
+            Contact(
+                kind="risk",
+                link=_link_of(at, sphere),
+                body=body,
+                depth=upper - float(bound or 0.0),
+                sphere=sphere,
+                position=as_point(sweep.centers[0, :, sphere]),
+                probability=count / at.worlds.n_worlds,
+                detail=f"upper bound of all {upper:.3f}, max_risk {bound}",
+            )
+            for (sphere, body, _), count in _touching(at, sweep, sweep.first).most_common()
+        )
 
     # --- estimates ---------------------------------------------------------------------
     def estimate(self, path: Waypoints, with_margin: bool = False) -> RiskEstimate:
@@ -426,13 +398,12 @@ class PathRisk:
             spacing=at.spacing,
             configurations=len(sweep.centers),
             trace=lambda: first_contacts(at, path, sweep, edge, float(stats[0])),
-            volume=lambda: self._shares(at, sweep.centers),
+            volume=lambda: self._codes.shares(sweep.centers, at.radii, at.sphere_tables),
         )
 
-    def _shares(self, at: Setting, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:
-        if self._codes is None:
-            self._codes = SpaceCodes(at.world)
-        return self._codes.shares(centers, at.radii, at.sphere_tables)
+    @cached_property
+    def _codes(self) -> "SpaceCodes":
+        return SpaceCodes(self.setting.world)
 
 
 class SpaceCodes:
@@ -481,9 +452,7 @@ def clopper_pearson(
     n: int, confidence: float
 ) -> tuple[Float[np.ndarray, " n1"], Float[np.ndarray, " n1"]]:
     """Bounds on a probability after k = 0..n hits in n trials: lower (n + 1,), upper (n + 1,).
-
-    Clopper and Pearson, Biometrika 26 (1934): each tail holds (1 - confidence) / 2.
-    """
+    Clopper and Pearson, Biometrika 26 (1934): each tail holds (1 - confidence) / 2."""
     k = np.arange(n + 1, dtype=np.float64)
     tail = 0.5 * (1.0 - confidence)
     lower, upper = np.zeros(n + 1), np.ones(n + 1)

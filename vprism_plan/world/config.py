@@ -109,8 +109,8 @@ class Cylinder(Primitive):
 class HalfSpace:
     """Everything below a plane, {x : normal . x < offset}: a wall, a floor, a ceiling.
 
-    `normal` (3,) points to the free side and is scaled to unit length with its `offset`
-    (metres). Half-spaces are checked exactly and cost no grid: use them for walls.
+    `normal` (3,) points to the free side and is scaled to unit length with its `offset` (metres).
+    Half-spaces are checked exactly and cost no grid: use them for walls.
     """
 
     name: str
@@ -190,36 +190,31 @@ class WorldConfig:
     Attributes:
         resolution: distance between the nodes of the distance field.
         level: the objects are {x : P(occupied)(x) >= level}.
-        occluded: what to do with space that a camera's ray would reach only through
-            something it saw.
-            "occupied" (default): it is an obstacle, also where the map's kernels reach.
-            A posterior that extrapolates "empty" a centimetre into a shadow can never
-            make a hidden object touchable.
-            "posterior": where the map has support (kernel mass >= `min_support`) the
-            posterior decides; elsewhere it is an obstacle.
-            "free": only the posterior decides.
-        unobserved: the same for space outside every image or behind pixels without a
-            depth return: "free" (default) or "occupied". Space outside the grid counts
-            as unobserved.
-        support: how far the support surface goes on.
-            "unbounded": everything below its plane is an obstacle.
-            "seen": only below the convex hull of what was seen of it and 5 cm around; what
-            else lies lower is judged like all other space.
-            "auto" (default): "seen" for a robot whose base stands more than 5 cm below the
-            plane, which its `CollisionChecker` then says, else "unbounded".
-        bounds: (lower, upper) corners of the box that the grid must cover at least; None
-            chooses the observed objects' box and room around it. The grid always
-            covers the whole level set and all known geometry.
+        occluded: what to do with space that a camera's ray would reach only through something it
+            saw. "occupied" (default): it is an obstacle, also where the map's kernels reach. A
+            posterior that extrapolates "empty" a centimetre into a shadow can never make a hidden
+            object touchable. "posterior": where the map has support (kernel mass >= `min_support`)
+            the posterior decides; elsewhere it is an obstacle. "free": only the posterior decides.
+        unobserved: the same for space outside every image or behind pixels without a depth return:
+            "free" (default) or "occupied". Space outside the grid counts as unobserved.
+        support: how far the support surface goes on. "unbounded": everything below its plane is an
+            obstacle. "seen": only below the convex hull of what was seen of it and 5 cm around;
+            what else lies lower is judged like all other space. "auto" (default): "seen" for a
+            robot whose base stands more than 5 cm below the plane, which its `CollisionChecker`
+            then says, else "unbounded".
+        bounds: (lower, upper) corners of the box that the grid must cover at least; None chooses
+            the observed objects' box and room around it. The grid always covers the whole level set
+            and all known geometry.
         known: obstacles the user adds: `Box`, `Sphere`, `Cylinder`, `HalfSpace`, `KnownMesh`.
         min_support: kernel mass from which the posterior counts (policy "posterior").
-        occlusion_tolerance: how far behind the measured depth shadow begins; at least
-            three standard deviations of a depth camera's noise at that range.
-        background_height: unlabelled points at least this far above the support plane
-            (or three standard deviations, if that is more) are obstacles ...
-        lone_share: ... unless they are flying pixels: alone, with points around them that
-            fill less than this share of what a surface facing the camera would show in
-            the 3 cm around. 0 (default) keeps every point. 0.03 drops what a noisy camera
-            strews behind outlines, and nothing as thick as a 1 mm rod.
+        occlusion_tolerance: how far behind the measured depth shadow begins; at least three
+            standard deviations of a depth camera's noise at that range.
+        background_height: unlabelled points at least this far above the support plane (or three
+            standard deviations, if that is more) are obstacles ...
+        lone_share: ... unless they are flying pixels: alone, with points around them that fill less
+            than this share of what a surface facing the camera would show in the 3 cm around. 0
+            (default) keeps every point. 0.03 drops what a noisy camera strews behind outlines, and
+            nothing as thick as a 1 mm rod.
 
     Raises:
         ConfigError: a value outside its range; the message names it and the range.

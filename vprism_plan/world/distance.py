@@ -47,9 +47,7 @@ def distance_to_lattice(
     lattice: Lattice, grid: Grid
 ) -> tuple[Nodes, UInt8[np.ndarray, "nx ny nz"]]:
     """Exact distance (metres, rounded down) from every node to the marked cells, and their label.
-
-    Infinite, with label 0, if nothing is marked.
-    """
+    Infinite, with label 0, if nothing is marked."""
     first = [int(v) for v in grid.first * lattice.factor - lattice.corner]
     nx, ny, nz = grid.shape
     X, Y, _ = lattice.labels.shape
@@ -85,21 +83,21 @@ def round_down(values: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*sha
 class DistanceField:
     """Lower bounds of the signed distance to a set of obstacles, at the nodes of a grid.
 
-    All obstacles lie inside the grid's box, or in `beyond`, or else (if `solid_outside`)
-    everything outside of the box is an obstacle too.
+    All obstacles lie inside the grid's box, or in `beyond`, or else (if `solid_outside`) everything
+    outside of the box is an obstacle too.
 
     Attributes:
         origin: (3,) world position of node (0, 0, 0), metres.
         spacing: between nodes, metres.
-        distance: (nx, ny, nz) float32 metres, rounded down. Outside the obstacles the
-            exact distance to the cells that cover them; inside, at most the negative
-            distance to the nearest point outside.
-        source: (nx, ny, nz) int16, index into `sources` of the nearest obstacle; -1
-            everywhere if there is none.
+        distance: (nx, ny, nz) float32 metres, rounded down. Outside the obstacles the exact
+            distance to the cells that cover them; inside, at most the negative distance to the
+            nearest point outside.
+        source: (nx, ny, nz) int16, index into `sources` of the nearest obstacle; -1 everywhere if
+            there is none.
         sources: names of the obstacles.
         solid_outside: whether space outside the grid is an obstacle.
-        beyond: a coarser field of the obstacles outside the grid's box, whose bounds the
-            nodes here already hold; None if there are none.
+        beyond: a coarser field of the obstacles outside the grid's box, whose bounds the nodes here
+            already hold; None if there are none.
     """
 
     origin: Vector
@@ -119,11 +117,10 @@ class DistanceField:
     def lower_bound(self, points: Points) -> Values:
         """Lower bound of the signed distance from world points to the obstacles, metres.
 
-        Never above the true distance. Between nodes it uses that the squared distance
-        less |x|^2 is concave, d(x)^2 >= sum_i w_i d_i^2 - sum_i w_i |x - x_i|^2 with the
-        trilinear weights w_i, and near or inside obstacles that the signed distance
-        changes by at most the way travelled, d(x) >= max_i d_i - |x - x_i|. WorldError if a point
-        is not finite.
+        Never above the true distance. Between nodes it uses that the squared distance less |x|^2 is
+        concave, d(x)^2 >= sum_i w_i d_i^2 - sum_i w_i |x - x_i|^2 with the trilinear weights w_i,
+        and near or inside obstacles that the signed distance changes by at most the way travelled,
+        d(x) >= max_i d_i - |x - x_i|. WorldError if a point is not finite.
         """
         points = checked_points(points)
         out = lower_bounds(points, self, self.distance, self.solid_outside)
@@ -143,9 +140,9 @@ class DistanceField:
     def distance_at(self, points: "torch.Tensor") -> "torch.Tensor":
         """Trilinear interpolation of the node distances, differentiable; (..., 3) to (...,).
 
-        For gradients, not for verdicts: it may exceed the true distance by up to a
-        voxel. Outside the grid: the distance to the box combined with the distance at
-        its nearest point, as for `lower_bound`.
+        For gradients, not for verdicts: it may exceed the true distance by up to a voxel. Outside
+        the grid: the distance to the box combined with the distance at its nearest point, as for
+        `lower_bound`.
         """
         import torch
 

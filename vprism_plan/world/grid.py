@@ -40,8 +40,8 @@ _FAR_BELOW = 0.5  # metres below it: its end must not count where the support su
 class Grid:
     """Nodes at spacing * (first + (i, j, k)) for 0 <= (i, j, k) < shape.
 
-    The origin is a whole number of steps from the world's origin, so that every finer
-    lattice of the world shares its nodes.
+    The origin is a whole number of steps from the world's origin, so that every finer lattice of
+    the world shares its nodes.
     """
 
     spacing: float
@@ -101,10 +101,8 @@ def _default_box(map_: Any, bounded: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grid_beyond(inner: Grid, plane: Plane | None, bounded: bool) -> Grid:
-    """Choose coarse nodes around a grid, as far as an arm beside the objects can reach.
-
-    Under a level table the support surface answers, unless it is `bounded`.
-    """
+    """Choose coarse nodes around a grid, as far as an arm beside the objects can reach. Under a
+    level table the support surface answers, unless it is `bounded`."""
     lower, upper = inner.origin - _FAR_REACH, inner.upper + _FAR_REACH
     if is_level(plane):
         lower[2] = inner.origin[2] - (_FAR_REACH if bounded else _FAR_BELOW)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The set {P(occupied) >= level} of a map, covered by small cells.
 
-An octree over the box in which the map has any support: a cell is dropped when the
-log-odds cannot reach the level in it, kept whole when they cannot fall below it, and
-divided otherwise. On a cell of edge h the log-odds g differ from the trilinear
-interpolation of their corners by at most sum_a h^2/8 max|g_aa|; the second derivatives
-come from the 27 points that dividing the parent evaluates anyway. They are finite
-differences of a smooth function, counted twice: not a proof for an arbitrary one.
+An octree over the box in which the map has any support: a cell is dropped when the log-odds cannot
+reach the level in it, kept whole when they cannot fall below it, and divided otherwise. On a cell
+of edge h the log-odds g differ from the trilinear interpolation of their corners by at most sum_a
+h^2/8 max|g_aa|; the second derivatives come from the 27 points that dividing the parent evaluates
+anyway. They are finite differences of a smooth function, counted twice: not a proof for an
+arbitrary one.
 """
 
 import math
@@ -127,8 +127,8 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`.
 
     Raises:
-        WorldError: the map says "occupied" where it has no evidence at all, or the cells would
-            fill the memory.
+        WorldError: the map says "occupied" where it has no evidence at all, or the cells would fill
+            the memory.
     """
     if map_.unsupported_occupancy >= level:
         raise WorldError(
@@ -212,11 +212,9 @@ def _border(
     owners: UInt8[np.ndarray, "n 3 3 3"],
     step: float,
 ) -> Cells:
-    """Divide cells of edge 4, known at every second node, into those of edge 1 that count.
-
-    The map is not evaluated again: a parabola through three nodes at a distance h is off
-    by at most h^3 / (9 sqrt 3) |g_aaa| per axis, and |g_aaa| is about 3 |g_a| / l^2.
-    """
+    """Divide cells of edge 4, known at every second node, into those of edge 1 that count. The map
+    is not evaluated again: a parabola through three nodes at a distance h is off by at most h^3 /
+    (9 sqrt 3) |g_aaa| per axis, and |g_aaa| is about 3 |g_a| / l^2."""
     fine = np.einsum("ai,bj,ck,nijk->nabc", _HALVES, _HALVES, _HALVES, g, optimize=True)
     # Second differences at half the spacing are a quarter of those in `g`.
     spread = np.ptp(g, axis=(1, 2, 3))
@@ -243,8 +241,8 @@ def rasterize_level_set(
 ) -> Lattice | None:
     """Mark the corners of the cells of a level set with the object class found there.
 
-    With `classes`, only, and the whole of, cells in which one of these is the most probable at
-    some corner. None if there is no cell.
+    With `classes`, only, and the whole of, cells in which one of these is the most probable at some
+    corner. None if there is no cell.
     """
     cells = level_set.cells
     if classes is not None:

@@ -73,14 +73,14 @@ class Evidence:
     def marks(
         self, occluded: OccludedPolicy, grid: Grid, objects: Nodes | None, inner: Grid | None = None
     ) -> Lattice:
-        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
-        object of the map holds.
+        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no object
+        of the map holds.
 
         Args:
             occluded: what to do with occluded space.
             grid: nodes of the field; the marks are `CELLS` times finer.
-            objects: distance from its nodes to the level set, metres; None marks all that was
-                seen of the objects.
+            objects: distance from its nodes to the level set, metres; None marks all that was seen
+                of the objects.
             inner: another grid whose box is not to be marked.
         """
         spacing = grid.spacing / CELLS
@@ -254,10 +254,8 @@ def _fill_inside(
 
 
 def winding_number(point: Vector, triangles: Float[np.ndarray, "f 3 3"]) -> float:
-    """How often a closed surface winds round a point: its solid angle over 4 pi.
-
-    Van Oosterom and Strackee, "The solid angle of a plane triangle" (1983), eq. 8.
-    """
+    """How often a closed surface winds round a point: its solid angle over 4 pi. Van Oosterom and
+    Strackee, "The solid angle of a plane triangle" (1983), eq. 8."""
     a, b, c = (triangles[:, i] - point for i in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))

@@ -29,9 +29,9 @@ def extract_meshes(
 ) -> "dict[int, trimesh.Trimesh]":
     """Closed surface of every object, world frame, metres.
 
-    Object k is {x : P(occupied) >= level and k is the most probable object}, so objects
-    do not overlap. Surfaces are watertight, with outward normals (positive volume). An
-    object that reaches the level nowhere on the grid is left out, with a warning.
+    Object k is {x : P(occupied) >= level and k is the most probable object}, so objects do not
+    overlap. Surfaces are watertight, with outward normals (positive volume). An object that reaches
+    the level nowhere on the grid is left out, with a warning.
 
     Args:
         map: a `VPrismMap`.
@@ -56,10 +56,8 @@ def extract_meshes(
 def extract_union_mesh(
     map: Any, level: float = 0.5, resolution: float = 0.01
 ) -> "trimesh.Trimesh | None":
-    """Closed surface of all objects together, {x : P(occupied) >= level}; None if empty.
-
-    Arguments, guarantees and errors as for `extract_meshes`.
-    """
+    """Closed surface of all objects together, {x : P(occupied) >= level}; None if empty. Arguments,
+    guarantees and errors as for `extract_meshes`."""
     probabilities, origin = _sample(map, level, resolution)
     mesh = surface(probabilities[..., 1:].sum(axis=-1) - level, origin, resolution)
     if mesh is None:
@@ -113,16 +111,16 @@ def extract_refined_meshes(
 ) -> "dict[int, trimesh.Trimesh]":
     """Closed surface of every object on the lattice of nodes spacing * integers, metres.
 
-    Objects are those of `extract_meshes`. A grid of spacing * 2^halvings is evaluated
-    wholly; cells in which the surface runs, and at first their neighbours, are halved
-    until they have the spacing. What is smaller than the first grid and touches none of
-    its nodes is not found. An object of which nothing is found is left out, with a warning.
+    Objects are those of `extract_meshes`. A grid of spacing * 2^halvings is evaluated wholly; cells
+    in which the surface runs, and at first their neighbours, are halved until they have the
+    spacing. What is smaller than the first grid and touches none of its nodes is not found. An
+    object of which nothing is found is left out, with a warning.
 
     Args:
         map, level: as there.
         spacing: edge of the marching cubes, metres.
-        halvings: how often cells are halved, up to 8; None takes the coarsest first grid that is
-            no wider than half a kernel length.
+        halvings: how often cells are halved, up to 8; None takes the coarsest first grid that is no
+            wider than half a kernel length.
 
     Raises:
         WorldError: a surface could not be closed.
@@ -253,9 +251,9 @@ def predicted(source: Any, points: Points) -> Float32[np.ndarray, "n k"]:
 def sample_box(
     source: Any, lower: Vector, upper: Vector, spacing: float, name: str, most: int = _MAX_NODES
 ) -> tuple[Float32[np.ndarray, "nx ny nz k"], Index]:
-    """Return class probabilities over a box (corners, metres) and a layer around it in which
-    all is empty, at whole multiples of the spacing (metres; `name` is what the user calls it),
-    and the first node in steps. `source` has `object_ids` and `predict_proba`.
+    """Return class probabilities over a box (corners, metres) and a layer around it in which all is
+    empty, at whole multiples of the spacing (metres; `name` is what the user calls it), and the
+    first node in steps. `source` has `object_ids` and `predict_proba`.
 
     Raises:
         ConfigError: more than `most` nodes.

@@ -38,33 +38,33 @@ class Tables:
 class PosteriorWorlds:
     """S joint draws of a map's weights: S worlds that the camera's view does not tell apart.
 
-    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1/2 at its centre x,
-    the level of the mesh, and belongs to the object of the largest logit. The same draw
-    holds everywhere, so what hides in one place is correlated with what hides next to it.
+    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1/2 at its centre x, the level
+    of the mesh, and belongs to the object of the largest logit. The same draw holds everywhere, so
+    what hides in one place is correlated with what hides next to it.
 
     Per voxel and draw one byte holds the distance to the nearest occupied voxel centre, rounded
     down, and is compared with a ball at the nodes of the cell around its centre; what they leave
     open is looked up voxel by voxel. An occupied voxel counts as the ball inscribed in it: a draw
     is touched if the centre of one is within radius + resolution / 2 of a ball's centre.
 
-    Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when
-    the first ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the
-    map's support grown by `reach`, S bytes per drawn voxel and S bytes per baked voxel
-    within `reach` of anything that any draw may occupy.
+    Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when the first
+    ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the map's support grown by
+    `reach`, S bytes per drawn voxel and S bytes per baked voxel within `reach` of anything that any
+    draw may occupy.
 
     Args:
         map: a `VPrismMap`.
         n_worlds: number of draws S, a multiple of 64.
         seed: of the draws; the same seed, the same worlds.
         resolution: edge of a voxel, metres; centres are whole multiples of it.
-        reach: distances up to this are known, metres: two and a half voxels more than the
-            largest ball that will be asked about. At most 31 voxels.
-        tolerance: how probable it may be that skipping the draws of nearly certain voxels
-            changes any answer.
+        reach: distances up to this are known, metres: two and a half voxels more than the largest
+            ball that will be asked about. At most 31 voxels.
+        tolerance: how probable it may be that skipping the draws of nearly certain voxels changes
+            any answer.
 
     Attributes:
-        error_free: bound on the probability that a draw differs in a voxel that was called
-            free without drawing: how much a probability of collision may be too low.
+        error_free: bound on the probability that a draw differs in a voxel that was called free
+            without drawing: how much a probability of collision may be too low.
         error_occupied: the same for voxels called occupied: how much it may be too high.
         first: index of the first voxel of the tables.
         tables: everything baked so far.
@@ -177,8 +177,8 @@ class PosteriorWorlds:
     ) -> Bool[np.ndarray, "n s"]:
         """Return in which draws each ball touches an occupied voxel.
 
-        Never misses a voxel centre inside a ball. The probability that a body swept along
-        a path touches anything is `touched(...).any(axis=0).mean()`.
+        Never misses a voxel centre inside a ball. The probability that a body swept along a path
+        touches anything is `touched(...).any(axis=0).mean()`.
 
         Args:
             centers: world, metres.
@@ -194,12 +194,8 @@ class PosteriorWorlds:
         rule = self.rule(without)
         out = np.empty((len(centers), self.n_worlds), np.bool_)
         while True:
-            tables = self.tables
             wanted = self.new_marks()
-            missing = kernels.touch_each(
-                centers, radii, rule, tables.distance_row, tables.rows, tables.lowest,
-                self.first, self.resolution, *self.scale, out, wanted,
-            )  # fmt: skip
+            missing = kernels.touch_each(centers, radii, rule, *self.baked(), out, wanted)
             if not missing:
                 return out
             self.bake_marked(wanted)
@@ -228,6 +224,12 @@ class PosteriorWorlds:
     def owner_tables(self) -> tuple[Any, Any, Any]:
         """Rows of the owners per voxel, the owners (S innermost), and the first voxel."""
         return self._owners.row, self._owners.table, self._owners.first
+
+    def baked(self) -> tuple[Any, ...]:
+        """What the kernels read: one snapshot of the tables, where they begin, and the scale."""
+        now = self.tables
+        parts = now.distance_row, now.rows, now.lowest, self.first, self.resolution
+        return (*parts, *self.scale)
 
     def new_marks(self) -> Bool[np.ndarray, "g bx by bz"]:
         """Return unset marks for blocks that have to be baked, per rule."""
@@ -351,12 +353,12 @@ class Verdicts:
 def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
     """Find the voxels whose draws are certain, so that nobody has to draw them.
 
-    With Gaussian logits z of mean m and variance v, and C objects, a draw occupies a voxel only
-    if some z_k - z_0 > -ln C: by the union bound its probability is at most
-    sum_k Phi(-(m_0 - m_k - ln C) / sqrt(v_0 + v_k)). It does not give the voxel to class k only
-    if z_k < z_0 or z_k < z_j for another object j: a sum of the same form. The voxels with the
-    smallest bounds are skipped, as many as sum up to half the tolerance each way: that bounds
-    the error of the probability of any event, a path's collision included.
+    With Gaussian logits z of mean m and variance v, and C objects, a draw occupies a voxel only if
+    some z_k - z_0 > -ln C: by the union bound its probability is at most sum_k Phi(-(m_0 - m_k - ln
+    C) / sqrt(v_0 + v_k)). It does not give the voxel to class k only if z_k < z_0 or z_k < z_j for
+    another object j: a sum of the same form. The voxels with the smallest bounds are skipped, as
+    many as sum up to half the tolerance each way: that bounds the error of the probability of any
+    event, a path's collision included.
     """
     lower, upper = (np.asarray(corner) for corner in map_.support_bounds())
     n_objects = len(map_.object_ids)
@@ -378,13 +380,8 @@ def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
     drawn = np.flatnonzero(~free & ~certain)
     row[drawn] = n_objects + np.arange(len(drawn), dtype=np.int32)
     voxels = np.column_stack(np.unravel_index(drawn, tuple(shape)))
-    return Verdicts(
-        first,
-        row.reshape(tuple(shape)),
-        voxels.astype(np.int64),
-        float(occupied[free].sum()),
-        float(lost[certain].sum()),
-    )
+    errors = float(occupied[free].sum()), float(lost[certain].sum())
+    return Verdicts(first, row.reshape(tuple(shape)), voxels.astype(np.int64), *errors)
 
 
 def _tails(
@@ -516,10 +513,8 @@ class Owners:
             self._drawn[block] = True
 
     def _classify(self, points: Points, out: UInt8[np.ndarray, "n s"]) -> None:
-        """Fill in the class that occupies each point (m) in each draw; 0 is none.
-
-        O(points x hinges near any x S x K): points should be near each other.
-        """
+        """Fill in the class that occupies each point (m) in each draw; 0 is none. O(points x hinges
+        near any x S x K): points should be near each other."""
         space, weights = self._map.space, self.sample()
         low, high = points.min(axis=0) - space.radius, points.max(axis=0) + space.radius
         near = np.flatnonzero(((space.hinges > low) & (space.hinges < high)).all(axis=1))

@@ -4,8 +4,8 @@
 With a return: a point of the object's surface. A thin part can stay below the level set: the
 kernels of the map are centimetres long, and the free space on both sides outweighs it.
 
-Without a return (glass, black, shiny things): somewhere along the ray the object's surface is,
-no nearer than its neighbours and its foot on the support surface allow, and no farther than that
+Without a return (glass, black, shiny things): somewhere along the ray the object's surface is, no
+nearer than its neighbours and its foot on the support surface allow, and no farther than that
 surface.
 """
 
@@ -36,9 +36,9 @@ def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
     """Return class, observed points of its surface (world, metres) and half the width of their
     pixels, per object and view of a map.
 
-    Points less than 3 mm (or three standard deviations of the noise) above the support surface
-    are its own, and points that stand alone are flying pixels, unless they are beside others.
-    What is lower counts as well if the support surface is `bounded`.
+    Points less than 3 mm (or three standard deviations of the noise) above the support surface are
+    its own, and points that stand alone are flying pixels, unless they are beside others. What is
+    lower counts as well if the support surface is `bounded`.
     """
     found = []
     plane = map_.plane
@@ -100,10 +100,10 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     """Return where the `lost_objects` may be, an entry for each that has more than small holes.
 
     The cone of a pixel without a return runs from the nearest depth at which the object's surface
-    is plausible to the farthest, or to the support surface. Nearest is the farthest of: the
-    upright plane through the front of its foot, of its other points and of what is seen beside
-    its mask, moved towards the camera by half its width; the height of 40 cm; and its own nearest
-    seen surface, continued towards the camera at two metres per metre. Farthest is that surface
+    is plausible to the farthest, or to the support surface. Nearest is the farthest of: the upright
+    plane through the front of its foot, of its other points and of what is seen beside its mask,
+    moved towards the camera by half its width; the height of 40 cm; and its own nearest seen
+    surface, continued towards the camera at two metres per metre. Farthest is that surface
     continued away from the camera. Holes of up to four pixels, noise, have no cone.
     """
     found: list[Cone] = []
@@ -228,10 +228,8 @@ class SeenSupport:
     region: TableRegion
 
     def signed_distance(self, points: Points) -> Values:
-        """Lower bound of the distance from world points, metres, negative inside.
-
-        Exact but for points beyond a corner of the hull.
-        """
+        """Lower bound of the distance from world points, metres, negative inside. Exact but for
+        points beyond a corner of the hull."""
         flat = points @ self.region.axes.T
         beside = np.full(len(points), -np.inf)
         for a, b, c in self.region.halfplanes:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the cameras saw, what they could not see, and where they did not look.
 
-A cell counts as seen only if one view sees all of it: every pixel that its image
-touches has a return, and the nearest of them lies no more than the tolerance in front
-of the cell's far side. So shadows are never too small, whatever the cell's size.
+A cell counts as seen only if one view sees all of it: every pixel that its image touches has a
+return, and the nearest of them lies no more than the tolerance in front of the cell's far side. So
+shadows are never too small, whatever the cell's size.
 """
 
 from collections.abc import Iterable, Sequence
@@ -134,11 +134,11 @@ def make_view(
 ) -> View:
     """Prepare an observation; `tolerance` (metres) is how far behind a return shadow begins.
 
-    `robots` are the balls of the robots in all views of the scene; None: in this one. The
-    tolerance grows with the noise of the sensor: three standard deviations. A ray that ends on
-    the support plane (within that noise) or under it has passed through free space only, as far
-    as space above the plane goes: such pixels cast no shadow, or the coarse cells on a table
-    seen at a glance would all hide behind one another. The robot casts one always.
+    `robots` are the balls of the robots in all views of the scene; None: in this one. The tolerance
+    grows with the noise of the sensor: three standard deviations. A ray that ends on the support
+    plane (within that noise) or under it has passed through free space only, as far as space above
+    the plane goes: such pixels cast no shadow, or the coarse cells on a table seen at a glance
+    would all hide behind one another. The robot casts one always.
     """
     depth = np.asarray(observation.depth, dtype=np.float64)
     valid = depth > 0
@@ -302,13 +302,12 @@ def clutter_pixels(
 ) -> Mask:
     """Which pixels show unlabelled things off the support plane.
 
-    "Off" is `height` metres, or three standard deviations of the depth noise along the normal,
-    if that is more; below the plane as well if the support is `bounded`. Without a plane every
-    unlabelled pixel is. Pixels of the robot are not clutter, nor, if `lone_share` is above 0,
-    are points that with all others off the plane fill less than that share of what a surface
-    facing the camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills
-    3 percent. What lies within 1.5 cm of a point that is none stays: tips and edges lack half
-    their surroundings.
+    "Off" is `height` metres, or three standard deviations of the depth noise along the normal, if
+    that is more; below the plane as well if the support is `bounded`. Without a plane every
+    unlabelled pixel is. Pixels of the robot are not clutter, nor, if `lone_share` is above 0, are
+    points that with all others off the plane fill less than that share of what a surface facing the
+    camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills 3 percent. What
+    lies within 1.5 cm of a point that is none stays: tips and edges lack half their surroundings.
     """
     points, labels = view.points()
     valid = view.depth > 0

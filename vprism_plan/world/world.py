@@ -41,18 +41,17 @@ _MAX_OBJECTS = 250
 class World:
     """Obstacles made of a map, what its cameras saw and did not see, and known geometry.
 
-    Observed points of an object that lie more than a voxel off the level set (parts
-    too thin for the map's kernels) are obstacles of that object, too.
+    Observed points of an object that lie more than a voxel off the level set (parts too thin for
+    the map's kernels) are obstacles of that object, too.
 
-    Everything is baked on construction. Sources, in this order: one per object, then
-    "background", "occluded", "unobserved", labelled objects without any depth return, then
-    known geometry; the support surface and known half-spaces are not in the field but in
-    `planes`.
+    Everything is baked on construction. Sources, in this order: one per object, then "background",
+    "occluded", "unobserved", labelled objects without any depth return, then known geometry; the
+    support surface and known half-spaces are not in the field but in `planes`.
 
-    What was seen outside the grid, and its shadow, is kept on a coarse grid around it (nodes
-    10 cm apart, 4.4 m beyond its faces), so an obstacle there is up to two such steps nearer
-    than it is. Beyond that nothing was judged: everything counts as "unobserved" and as an
-    obstacle, whatever the policies say.
+    What was seen outside the grid, and its shadow, is kept on a coarse grid around it (nodes 10 cm
+    apart, 4.4 m beyond its faces), so an obstacle there is up to two such steps nearer than it is.
+    Beyond that nothing was judged: everything counts as "unobserved" and as an obstacle, whatever
+    the policies say.
 
     Args:
         map: a `VPrismMap`.
@@ -60,10 +59,10 @@ class World:
 
     Attributes:
         grid: nodes of the field.
-        field: distance to objects, background, occluded or unobserved space (by policy)
-            and known geometry.
-        planes: (P, 4) float64 rows (nx, ny, nz, offset): obstacles {x : n . x < offset},
-            metres; the support surface first, if the map has one. Read-only.
+        field: distance to objects, background, occluded or unobserved space (by policy) and known
+            geometry.
+        planes: (P, 4) float64 rows (nx, ny, nz, offset): obstacles {x : n . x < offset}, metres;
+            the support surface first, if the map has one. Read-only.
         plane_names: their names.
         sources: names that `field.source` indexes.
         timings: seconds per step of the bake.
@@ -185,10 +184,8 @@ class World:
     def _around(
         self, marks: Lattice | None, faces: bool
     ) -> tuple[DistanceField | None, list[NodeDistances]]:
-        """The field of marks outside the grid, and what it says inside, if there are any.
-
-        With `faces`, everything farther away is an obstacle as well.
-        """
+        """The field of marks outside the grid, and what it says inside, if there are any. With
+        `faces`, everything farther away is an obstacle as well."""
         if marks is None:
             return None, []
         grid = self._grid_beyond
@@ -262,8 +259,8 @@ class World:
     def fields_without(self, object_ids: Collection[int]) -> DistanceField:
         """Return the combined field without some objects, for contacts that are allowed.
 
-        Occluded space inside the left-out objects' level set goes with them; occluded space
-        beyond it stays, as do all other sources. WorldError if the map has no such object.
+        Occluded space inside the left-out objects' level set goes with them; occluded space beyond
+        it stays, as do all other sources. WorldError if the map has no such object.
         """
         gone = frozenset(classes_of(self.map, object_ids))
         if not gone:
@@ -280,12 +277,12 @@ class World:
     ) -> DistanceField:
         """Distance to what is an obstacle whatever the posterior says.
 
-        Background, seen parts that the level set misses, known geometry, unobserved space
-        by its policy, and occluded space where the map has too little support to judge
-        (unless the policy is "free"). The rest is for `posterior_worlds` to say; with
-        `level_set`, the objects where P(occupied) >= level belong to it as well. The
-        objects `without`, and their seen parts, are left out. With `seen`, so does whatever
-        was seen of an object, wherever the level set is. WorldError if the map has no such object.
+        Background, seen parts that the level set misses, known geometry, unobserved space by its
+        policy, and occluded space where the map has too little support to judge (unless the policy
+        is "free"). The rest is for `posterior_worlds` to say; with `level_set`, the objects where
+        P(occupied) >= level belong to it as well. The objects `without`, and their seen parts, are
+        left out. With `seen`, so does whatever was seen of an object, wherever the level set is.
+        WorldError if the map has no such object.
         """
         gone = frozenset(classes_of(self.map, without))
         key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
@@ -306,9 +303,9 @@ class World:
     def source_field(self, name: str, without: Collection[int] = ()) -> DistanceField:
         """Distance to one of `sources` alone; baked on first use and kept.
 
-        At no node is it below `field`, so neither are the bounds between nodes; the smallest
-        over all sources is `field` wherever that is positive, less the end of what was judged,
-        metres away. An object's own field holds its level set and its seen surfaces off it.
+        At no node is it below `field`, so neither are the bounds between nodes; the smallest over
+        all sources is `field` wherever that is positive, less the end of what was judged, metres
+        away. An object's own field holds its level set and its seen surfaces off it.
 
         Args:
             name: one of `sources`, or WorldError.
@@ -382,9 +379,9 @@ class World:
     def status(self, points: Points) -> UInt8[np.ndarray, " n"]:
         """What the cameras know of each world point, whatever the policies say.
 
-        0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or
-        under the support surface. 2 (unobserved): outside every image, or no depth
-        return. 3: outside the grid and what was judged around it. WorldError if one is not finite.
+        0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or under the
+        support surface. 2 (unobserved): outside every image, or no depth return. 3: outside the
+        grid and what was judged around it. WorldError if one is not finite.
         """
         points = checked_points(points)
         status = visibility.classify_points(self._evidence.views, points)
@@ -418,8 +415,8 @@ class World:
     def for_base(self, base: Vector) -> "World":
         """Return the world for a robot whose base stands there (world, metres).
 
-        This world, or with `support="auto"` and a base more than 5 cm below the support plane
-        one whose support surface ends where it was seen to end; baked once.
+        This world, or with `support="auto"` and a base more than 5 cm below the support plane one
+        whose support surface ends where it was seen to end; baked once.
 
         Raises:
             PlaneNotFoundError: too little of the surface was seen to say where that is.

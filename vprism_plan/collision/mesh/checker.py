@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A second opinion by FCL: the surfaces of a world against the solids of a robot.
 
-It judges the same map at the same level for the same robot, but with neither the distance
-field, nor the octree that it is traced with, nor the compiled kernels; and what the cameras
-saw it takes from the images, so it can contradict the map as well.
+It judges the same map at the same level for the same robot, but with neither the distance field,
+nor the octree that it is traced with, nor the compiled kernels; and what the cameras saw it takes
+from the images, so it can contradict the map as well.
 """
 
 import math
@@ -35,40 +35,40 @@ _MAX_CONFIGURATIONS = 1_000_000
 class MeshChecker(explain.Checker):
     """Checks a robot's solids against extracted meshes, half-spaces and known geometry.
 
-    What it judges: every object's surface {P(occupied) >= level} as a closed mesh, the
-    support surface and known half-spaces (by formula), known primitives and meshes,
-    self-collision of the pairs the robot tests, and joint limits; and, by the images alone,
-    every observed point off the support surface (a ball of half its pixel's width) and, as
-    the world's policies say, hidden space. Of hidden space it asks one point per 3 cm cube of
-    the solids' surfaces, so a shadow narrower than that can be missed.
+    What it judges: every object's surface {P(occupied) >= level} as a closed mesh, the support
+    surface and known half-spaces (by formula), known primitives and meshes, self-collision of the
+    pairs the robot tests, and joint limits; and, by the images alone, every observed point off the
+    support surface (a ball of half its pixel's width) and, as the world's policies say, hidden
+    space. Of hidden space it asks one point per 3 cm cube of the solids' surfaces, so a shadow
+    narrower than that can be missed.
 
-    The robot is what the URDF has, scaled if the robot was scaled, whatever its spheres are.
-    Its padding is a distance to keep from the world, beside `config.margin`.
+    The robot is what the URDF has, scaled if the robot was scaled, whatever its spheres are. Its
+    padding is a distance to keep from the world, beside `config.margin`.
 
-    FCL's meshes are hollow. A solid that no surface cuts lies wholly on one side, and the
-    map's level set at one of its points says which (for known meshes: the winding number).
-    Links that no joint moves are not checked against the world: they stand on it.
-    Touching counts as collision. FCL's own tolerance is about 1e-5 m.
+    FCL's meshes are hollow. A solid that no surface cuts lies wholly on one side, and the map's
+    level set at one of its points says which (for known meshes: the winding number). Links that no
+    joint moves are not checked against the world: they stand on it. Touching counts as collision.
+    FCL's own tolerance is about 1e-5 m.
 
-    It answers the questions of `CollisionChecker` by the same names and can be given to `plan`
-    in its place, some hundred times slower, with edges checked at discrete configurations.
-    Not safe to share between threads: shapes are moved while they are asked about.
+    It answers the questions of `CollisionChecker` by the same names and can be given to `plan` in
+    its place, some hundred times slower, with edges checked at discrete configurations. Not safe to
+    share between threads: shapes are moved while they are asked about.
 
     Args:
         world: what to avoid.
         robot: whose configurations are asked about.
-        config: margins and allowed contacts. `max_risk` is not judged (nothing is drawn here),
-            and `min_motion` says nothing of what is sampled by `step`.
-        links: "geometry": the URDF's meshes, boxes, cylinders and spheres, or `link_meshes`,
-            and the collision spheres of links that have neither (or whose meshes are missing,
-            or in more than 20 pieces). "spheres": the collision spheres of every link.
+        config: margins and allowed contacts. `max_risk` is not judged (nothing is drawn here), and
+            `min_motion` says nothing of what is sampled by `step`.
+        links: "geometry": the URDF's meshes, boxes, cylinders and spheres, or `link_meshes`, and
+            the collision spheres of links that have neither (or whose meshes are missing, or in
+            more than 20 pieces). "spheres": the collision spheres of every link.
         link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres, in place of its
             primitives.
-        resolution: edge of the objects' marching cubes, metres. None: the lattice of the
-            world's distance field (a quarter of its resolution), on which no mesh reaches
-            beyond what the field encloses. A coarser mesh is made sooner, and may.
-        step: motion, metres, that no point of the robot exceeds between two configurations of
-            an edge: a collision may hide in at most half of that.
+        resolution: edge of the objects' marching cubes, metres. None: the lattice of the world's
+            distance field (a quarter of its resolution), on which no mesh reaches beyond what the
+            field encloses. A coarser mesh is made sooner, and may.
+        step: motion, metres, that no point of the robot exceeds between two configurations of an
+            edge: a collision may hide in at most half of that.
         seen: False leaves observed points and hidden space out: surfaces alone.
 
     Raises:
@@ -116,8 +116,8 @@ class MeshChecker(explain.Checker):
     def like(cls, checker: Any, **options: Any) -> "MeshChecker":
         """Make the second opinion on a `CollisionChecker`: its world, robot, margins and rules.
 
-        What its edges may miss (`config.tolerance`) is taken off the margins: paths are
-        shaved down to them.
+        What its edges may miss (`config.tolerance`) is taken off the margins: paths are shaved down
+        to them.
 
         Args:
             checker: a `CollisionChecker`.
@@ -160,14 +160,14 @@ class MeshChecker(explain.Checker):
         """Return the distance from the moving links to the nearest surface, metres.
 
         At most 0 exactly when a moving link touches the world. The margin is not subtracted,
-        padding is; self-collision, joint limits and what `allowed_contacts` permits do not
-        enter. inf if there is nothing.
+        padding is; self-collision, joint limits and what `allowed_contacts` permits do not enter.
+        inf if there is nothing.
 
-        Apart, the figure is FCL's distance, exact for what is compared; of hidden space only
-        that a link is in it is known (0). In touch it is what FCL can say: exact depth for
-        half-spaces, for spheres against anything, and between primitives; 0 for a box,
-        cylinder or mesh that crosses a mesh's surface (FCL has no depth for that); minus the
-        gap to the surface for one wholly inside. RobotError if q is not finite.
+        Apart, the figure is FCL's distance, exact for what is compared; of hidden space only that a
+        link is in it is known (0). In touch it is what FCL can say: exact depth for half-spaces,
+        for spheres against anything, and between primitives; 0 for a box, cylinder or mesh that
+        crosses a mesh's surface (FCL has no depth for that); minus the gap to the surface for one
+        wholly inside. RobotError if q is not finite.
         """
         self.placed.place(self.robot.check_configuration(q))
         return self._queries.clearance()
@@ -207,8 +207,8 @@ class MeshChecker(explain.Checker):
         Args:
             q: configuration.
             link: one of `robot.link_names`, or RobotError.
-            body: "object:3", "known:NAME", a half-space, or another link; inf for what
-                has no surface here ("occluded", an object left out of the meshes, ...).
+            body: "object:3", "known:NAME", a half-space, or another link; inf for what has no
+                surface here ("occluded", an object left out of the meshes, ...).
         """
         self.placed.place(self.robot.check_configuration(q))
         if link not in self.robot.link_names:
@@ -224,9 +224,9 @@ class MeshChecker(explain.Checker):
     def check_motion_buffer(self, qa: Configuration, qb: Configuration) -> bool:
         """`check_motion` without looking at shapes, at discrete configurations.
 
-        Between two of them no point of the robot moves more than `step` metres. (FCL's
-        continuous check crashes or misses with meshes, and is not used.) ConfigError if that
-        asks for too many.
+        Between two of them no point of the robot moves more than `step` metres. (FCL's continuous
+        check crashes or misses with meshes, and is not used.) ConfigError if that asks for too
+        many.
         """
         return all(self.is_valid_buffer(q) for _, q in self._between(qa, qb))
 
@@ -279,9 +279,9 @@ class MeshChecker(explain.Checker):
         """Check a path that another checker accepted, and say why the two disagree.
 
         Returns:
-            `check_path`, with the causes of each disagreement as `compare` names them;
-            "edge tolerance" where the checker refuses the very configuration, too, and
-            accepted the edge within its tolerance.
+            `check_path`, with the causes of each disagreement as `compare` names them; "edge
+            tolerance" where the checker refuses the very configuration, too, and accepted the edge
+            within its tolerance.
         """
         opinion = self.check_path(path)
         findings = tuple(

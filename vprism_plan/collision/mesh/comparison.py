@@ -51,8 +51,8 @@ class Cause:
         kind: the cause.
         link: link in contact.
         body: what it touches.
-        amount: metres: how far the solids stay from the surface ("conservative spheres"),
-            the spheres do ("margin", "voxel inflation"), or the depth of the contact.
+        amount: metres: how far the solids stay from the surface ("conservative spheres"), the
+            spheres do ("margin", "voxel inflation"), or the depth of the contact.
     """
 
     kind: str
@@ -194,8 +194,8 @@ def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
         Q: (n, dof) finite configurations.
 
     Returns:
-        The comparison. A disagreement has one cause per contact of the checker that
-        refuses: each of them alone would have made the difference.
+        The comparison. A disagreement has one cause per contact of the checker that refuses: each
+        of them alone would have made the difference.
 
     Raises:
         RobotError: Q does not have shape (n, dof) or is not finite.
@@ -268,10 +268,8 @@ def _of_surface(checker: Any, meshes: Any, contact: Contact, q: Configuration) -
 
 
 def _ball_gap(meshes: Any, center: Vector, radius: float, named: str) -> float:
-    """Signed distance of a ball to the surfaces of the kind that a contact names.
-
-    For an object: to any of them, since the field names the nearest to a grid node.
-    """
+    """Signed distance of a ball to the surfaces of the kind that a contact names. For an object: to
+    any of them, since the field names the nearest to a grid node."""
     surfaces = meshes.surfaces
     objects = object_id(named) is not None
     inside = objects and surfaces.object_at(center[None])[0] > 0

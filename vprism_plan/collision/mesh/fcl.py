@@ -2,10 +2,10 @@
 """The few calls of FCL that can be trusted, each with what it can and cannot say.
 
 Meshes are hollow to FCL; primitives are solid. What is left out on purpose: its continuous
-collision check (crashes or misses with meshes), its managers (a moved object that is not
-reported to them is looked for where it was, and exceptions in callbacks are swallowed), and
-its figures for a sphere that overlaps a mesh (depth and distance are garbage there; the
-distance from the sphere's centre is exact instead), and its signed distance.
+collision check (crashes or misses with meshes), its managers (a moved object that is not reported
+to them is looked for where it was, and exceptions in callbacks are swallowed), and its figures for
+a sphere that overlaps a mesh (depth and distance are garbage there; the distance from the sphere's
+centre is exact instead), and its signed distance.
 """
 
 from functools import cache
@@ -118,10 +118,8 @@ def gap(a: Shape, b: Shape) -> float:
 
 
 def signed_gap(a: Shape, b: Shape) -> float:
-    """Distance between two solids (no meshes), metres; minus the way out where they overlap.
-
-    FCL's own signed distance errs by up to 0.2 mm; its distance and its depth do not.
-    """
+    """Distance between two solids (no meshes), metres; minus the way out where they overlap. FCL's
+    own signed distance errs by up to 0.2 mm; its distance and its depth do not."""
     touch = deepest_touch(a, b)
     return gap(a, b) if touch is None else touch[0]
 
@@ -170,10 +168,10 @@ def deepest_touch(
     """Return where two shapes intersect most, or None: minus the depth (metres), where, and the
     unit vector that leads from the first to the second, world.
 
-    Between solids the depth is the way out; for a sphere and a mesh, how far the surface
-    reaches into the sphere. For other shapes and a mesh it is FCL's figure for the deepest
-    triangle, which is local: it says how far the solid reaches through one triangle, not
-    how far it has to move. A mesh's normal is the triangle's own.
+    Between solids the depth is the way out; for a sphere and a mesh, how far the surface reaches
+    into the sphere. For other shapes and a mesh it is FCL's figure for the deepest triangle, which
+    is local: it says how far the solid reaches through one triangle, not how far it has to move. A
+    mesh's normal is the triangle's own.
     """
     module = fcl()
     request = module.CollisionRequest(num_max_contacts=_MAX_CONTACTS, enable_contact=True)

@@ -23,9 +23,9 @@ from vprism_plan.world.visibility import UNSEEN
 class Queries:
     """Answers about the configuration that was placed last.
 
-    Bounds are compared with numpy first, and FCL is asked only about pairs whose bounds
-    meet: no manager has to be told what moved. `allowed` says of each link and class whether
-    they may touch (class 0 never), `seen` whether observed points and hidden space count, too.
+    Bounds are compared with numpy first, and FCL is asked only about pairs whose bounds meet: no
+    manager has to be told what moved. `allowed` says of each link and class whether they may touch
+    (class 0 never), `seen` whether observed points and hidden space count, too.
     """
 
     def __init__(

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the cameras saw off the support surface, and what they could not see, point by point.
-
-Of the map this takes the images alone: neither its classes nor the field have a say.
-"""
+"""What the cameras saw off the support surface, and what they could not see, point by point. Of the
+map this takes the images alone: neither its classes nor the field have a say."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -26,9 +24,9 @@ _ENOUGH = 64  # points of one body whose depth in a solid is worked out, those d
 class SeenPoints:
     """Observed points off the support surface, as balls of half their pixel's width.
 
-    Those of the robot are none, nor are flying pixels: the same pixels count as for the world,
-    but all of them, however near they lie to the map's surfaces. Where a labelled pixel has no
-    depth, the points where its object may be, a grid step apart.
+    Those of the robot are none, nor are flying pixels: the same pixels count as for the world, but
+    all of them, however near they lie to the map's surfaces. Where a labelled pixel has no depth,
+    the points where its object may be, a grid step apart.
 
     Attributes:
         bodies: what the points show, and how that is known: ("object:3", SEEN), ...
@@ -124,8 +122,8 @@ def judged_field(world: Any) -> Any:
 class HiddenSpace:
     """What no camera saw, by the world's policies, asked at points of the robot's surface.
 
-    One point per cube of 3 cm of each moving solid's surface, moved outward by its padding.
-    What lies between the points is not noticed.
+    One point per cube of 3 cm of each moving solid's surface, moved outward by its padding. What
+    lies between the points is not noticed.
     """
 
     def __init__(self, world: Any, placed: PlacedSolids, padding: Values) -> None:
@@ -192,10 +190,8 @@ class HiddenSpace:
         return codes
 
     def _leave_to_posterior(self, points: Points, hidden: Chosen) -> None:
-        """Call what the map has support for not hidden, unless clutter hides it.
-
-        Half the support is enough here: the world asks at the middle of a cell.
-        """
+        """Call what the map has support for not hidden, unless clutter hides it. Half the support
+        is enough here: the world asks at the middle of a cell."""
         rows = np.flatnonzero(hidden)
         if len(rows) == 0:
             return

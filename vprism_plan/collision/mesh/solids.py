@@ -102,11 +102,9 @@ def robot_solids(
 
 
 def _own_meshes(robot: Robot, name: str) -> list[Any] | None:
-    """The URDF's meshes of a link; None if it has none that can stand for it.
-
-    Files that are missing, and meshes in so many pieces that each triangle would be a solid of
-    its own, are left to the spheres.
-    """
+    """The URDF's meshes of a link; None if it has none that can stand for it. Files that are
+    missing, and meshes in so many pieces that each triangle would be a solid of its own, are left
+    to the spheres."""
     files = robot.meshes.get(name, ())
     if not files or any(file.path is None for file in files):
         return None
@@ -291,11 +289,9 @@ class PlacedSolids:
         return float(np.max(np.abs(delta) @ self._levers, initial=0.0))
 
     def _lever_table(self) -> Float[np.ndarray, "dof links"]:
-        """Metres that any point of a link can move per unit of each joint.
-
-        The table of the checker bounds the sphere centres; a solid's farthest point is at
-        most the way to the nearest sphere centre and the solid's ball beyond that.
-        """
+        """Metres that any point of a link can move per unit of each joint. The table of the checker
+        bounds the sphere centres; a solid's farthest point is at most the way to the nearest sphere
+        centre and the solid's ball beyond that."""
         arrays = self.robot.arrays
         in_link = _spheres_in_links(self.robot)
         beyond = np.zeros(len(self.robot.link_names))
@@ -342,8 +338,8 @@ class MeshWorld:
     """Bodies of a world, and where its objects are.
 
     Attributes:
-        bodies: objects in the map's order, then known geometry, then a support surface that
-            ends somewhere.
+        bodies: objects in the map's order, then known geometry, then a support surface that ends
+            somewhere.
         resolution: edge of the marching cubes, metres.
         meshes: object id -> `trimesh.Trimesh`, world frame.
     """
@@ -378,11 +374,8 @@ class MeshWorld:
         return np.sqrt(np.einsum("nbi,nbi->nb", out, out))
 
     def object_at(self, points: Points) -> Int[np.ndarray, "n"]:
-        """Class (1..C) of the object that holds each point, 0 if none does.
-
-        The level set decides, not the mesh: a closed surface says nothing to FCL about
-        its inside.
-        """
+        """Class (1..C) of the object that holds each point, 0 if none does. The level set decides,
+        not the mesh: a closed surface says nothing to FCL about its inside."""
         owner = np.zeros(len(points), dtype=np.int64)
         to_boxes = self.box_distances(points)[:, self.classes > 0]
         near = np.flatnonzero((to_boxes <= 0.0).any(axis=1))
