@@ -274,14 +274,11 @@ class CollisionChecker(explain.Checker):
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return world, own
 
-    # --- margins ---------------------------------------------------------------------------
-
     safety_margin = margins.safety_margin
     min_clearance = motion.min_clearance
     max_safe_motion = motion.max_safe_motion
     path_entropy = entropy.path_entropy
 
-    # --- risk --------------------------------------------------------------------------
     @property
     def max_risk(self) -> float | None:
         """Bound on the probability of collision of what is valid, or None."""

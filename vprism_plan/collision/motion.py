@@ -127,9 +127,6 @@ def sphere_jacobians(
     return centers, jacobian
 
 
-# --- bounds over whole motions --------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class PathClearance:
     """Answer of `min_clearance`; metres.

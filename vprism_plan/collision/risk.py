@@ -126,9 +126,6 @@ def make_setting(
     )  # fmt: skip
 
 
-# --- counting -------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Sweep:
     """Samples of a path and what they touch."""
@@ -211,9 +208,6 @@ def _touch(
         worlds.bake_marked(wanted)
 
 
-# --- causes ---------------------------------------------------------------------------
-
-
 def first_contacts(
     at: Setting, path: Waypoints, sweep: Sweep, edge: int, fraction: float
 ) -> tuple[FirstContact, ...]:
@@ -274,9 +268,6 @@ def _certain_cause(at: Setting, path: Waypoints, edge: int, fraction: float) -> 
     return body, _link_of(at, s)
 
 
-# --- verdicts and estimates ------------------------------------------------------------
-
-
 class PathRisk:
     """Verdicts on and estimates of a robot among the posterior worlds of one map; `allowed` is
     how many may collide with what is valid, under `config.max_risk`."""
@@ -323,7 +314,6 @@ class PathRisk:
             self._held_out = other
         return self._held_out
 
-    # --- verdicts ----------------------------------------------------------------------
     def accepts(self, path: Waypoints) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
         obstacles aside."""
@@ -363,7 +353,6 @@ class PathRisk:
             for (sphere, body, _), count in _touching(at, sweep, sweep.first).most_common()
         )
 
-    # --- estimates ---------------------------------------------------------------------
     def estimate(self, path: Waypoints, with_margin: bool = False) -> RiskEstimate:
         """Return the joint probability of collision along a path, or of coming within the
         margin; of a configuration, where the path has one row."""

@@ -154,7 +154,6 @@ class PosteriorWorlds:
         needed = np.argwhere(self._grown == kernels.UNBAKED)
         self._bake(0, needed[:1] // BLOCK)
 
-    # --- what is where ---------------------------------------------------------------
     def owners(self, index: Int[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n s"]:
         """Return which object occupies each voxel (centres are `resolution * index`, metres) in
         each draw: 0 free, k the object `map.object_ids[k - 1]`; WorldError if index is not (n, 3)
@@ -219,7 +218,6 @@ class PosteriorWorlds:
         parts = self._owners, self._grown, self.tables.distance_row, self.tables.rows
         return sum(int(p.nbytes) for p in parts)
 
-    # --- for the risk of robots ----------------------------------------------------------
     @property
     def owner_tables(self) -> tuple[Any, Any, Any]:
         """Rows of the owners per voxel, the owners (S innermost), and the first voxel."""
@@ -271,7 +269,6 @@ class PosteriorWorlds:
                 f"with reach of at least {largest + 2.5 * self.resolution:.3f} m"
             )
 
-    # --- drawing and baking ----------------------------------------------------------
     def _grow(self) -> Int32[np.ndarray, "ex ey ez"]:
         """Mark the voxels within reach of any that a draw may occupy: they need a row."""
         possible = np.pad(self._owners.row >= 0, self._whole)

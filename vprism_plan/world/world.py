@@ -136,8 +136,6 @@ class World:
         self.timings[name] = time.perf_counter() - start
         return result
 
-    # --- parts -----------------------------------------------------------------
-
     def _half_spaces(self) -> tuple[tuple[str, ...], Float[np.ndarray, "p 4"]]:
         names, rows = [], []
         if self.map.plane is not None and not self._bounded:
@@ -243,8 +241,6 @@ class World:
         nodes = combine([*parts, *inside], self.grid)
         outside = self.config.unobserved == "occupied"
         return finish(nodes, self.grid, self.sources, outside, beyond)
-
-    # --- queries ---------------------------------------------------------------
 
     def object_field(self, object_id: int) -> DistanceField:
         """Distance to one object alone: where P(occupied) >= level and it is the likeliest, to

@@ -223,9 +223,6 @@ def causes_between(checker: Any, mesh_checker: Any, q: Configuration) -> tuple[C
     return tuple(_of_field(checker, mesh_checker, contact, q) for contact in by_field.contacts)
 
 
-# --- the field refuses, meshes accept ------------------------------------------------
-
-
 def _of_field(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> Cause:
     amount = contact.depth
     if contact.body in SOURCES and SOURCES[contact.body].beyond:
@@ -259,7 +256,10 @@ def _of_surface(checker: Any, meshes: Any, contact: Contact, q: Configuration) -
     if gap <= margin:
         return "margin", gap
     if contact.kind == "object":
-        if not _level_set_refuses(checker, center, radius):
+        # The level sets alone, without thin seen parts.
+        fields = map(checker.world.object_field, checker.world.map.object_ids)
+        nearest = min(float(field.lower_bound(center[None])[0]) for field in fields)
+        if nearest - radius > margin:
             return "thin seen part", contact.depth
         if contact.body not in {body.name for body in meshes.surfaces.bodies}:
             return "too small for the mesh", contact.depth
@@ -288,26 +288,18 @@ def _ball_gap(meshes: Any, center: Vector, radius: float, named: str) -> float:
     return best
 
 
-def _level_set_refuses(checker: Any, center: Vector, radius: float) -> bool:
-    """Whether the objects' level sets alone, without thin seen parts, refuse a sphere."""
-    world = checker.world
-    nearest = min(
-        float(world.object_field(i).lower_bound(center[None])[0]) for i in world.map.object_ids
-    )
-    return nearest - radius <= checker.config.margin
-
-
-# --- meshes refuse, the field accepts ------------------------------------------------
-
-
 def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> Cause:
+    bound = checker.config.max_risk  # draws judge objects in place of the level set above its level
+    draws_judge = bound is not None and bound >= checker.world.config.level
     kind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
         kind = "unexplained"  # a joint limit: both know the same
-    elif contact.kind == "object" and _field_allows(checker, contact):
+    elif contact.kind == "object" and object_id(contact.body) in checker.allowed_objects(
+        checker.robot.link_names.index(contact.link)
+    ):
         kind = "contact rules"
-    elif contact.kind == "object" and contact.detail != SEEN and _draws_judge(checker):
+    elif contact.kind == "object" and contact.detail != SEEN and draws_judge:
         kind = "posterior risk"
     elif contact.depth <= _TOLERANCE and not source_of(contact.body).policy:
         kind = "rounding"
@@ -318,26 +310,12 @@ def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> C
     return Cause(kind, contact.link, contact.body, contact.depth)
 
 
-def _draws_judge(checker: Any) -> bool:
-    """Whether draws judge the objects in place of the level set: below its level, both do."""
-    bound = checker.config.max_risk
-    return bound is not None and bound >= checker.world.config.level
-
-
 def _in_level_set(checker: Any, contact: Contact) -> bool:
     """Whether the map calls the point of contact, or the deepest one behind it, occupied."""
     point = np.array(contact.position)
     deepest = point - max(0.0, contact.depth - contact.required) * np.array(contact.normal)
     occupied = np.asarray(checker.world.map.occupancy(np.stack([point, deepest])))
     return bool((occupied >= checker.world.config.level).any())
-
-
-def _field_allows(checker: Any, contact: Contact) -> bool:
-    """Whether the field's checker lets the link touch the object."""
-    return any(
-        object_id(contact.body) in ids and contact.link in checker.robot.links_of(name)
-        for name, ids in checker.config.allowed_contacts.items()
-    )
 
 
 def _in_spheres(meshes: Any, q: Configuration, links: tuple[str, ...], contact: Contact) -> bool:

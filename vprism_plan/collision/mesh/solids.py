@@ -308,8 +308,6 @@ class PlacedSolids:
         return out
 
 
-# --- worlds ----------------------------------------------------------------------------
-
 _DEEP = 5.0  # metres: what is under a surface that ends reaches down farther than any robot
 
 
