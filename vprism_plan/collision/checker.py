@@ -94,9 +94,9 @@ class CollisionChecker(explain.Checker):
         """Return what verdicts under a bound on risk go by beside the draws.
 
         Touching a point that is occupied with at least the probability `level` breaks a bound below
-        the level by itself. The draws are counted voxel by voxel, each as the ball inscribed in it:
-        alone they let a planner shave millimetres off a surface that everybody sees. Under a bound
-        above the level the seen surfaces alone are obstacles.
+        the level by itself; the draws, counted as the balls inside voxels, would alone let a
+        planner shave millimetres off a surface that everybody sees. Under a bound above the level
+        the seen surfaces alone are obstacles.
         """
         world = self._ruled_world()
         within = bound < world.config.level

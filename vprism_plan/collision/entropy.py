@@ -21,24 +21,23 @@ _CHUNK = 1 << 20  # voxel candidates in memory at once
 
 @dataclass(frozen=True)
 class PathEntropy:
-    """Answer of `path_entropy`. Only links that joints move count.
+    """Answer of `path_entropy`; nats. Only links that joints move count.
 
     The map's entropy means something where it has support (kernel mass at least
     `WorldConfig.min_support`); elsewhere it repeats the prior. Means, maxima and totals are over
     supported volume only; the rest is reported as a share.
 
     Attributes:
-        waypoint_mean: (T,) entropy averaged over the spheres' supported volume, nats; nan where no
-            part of the robot is in supported space.
-        waypoint_max: (T,) largest average of any one sphere, nats; nan likewise.
+        waypoint_mean: (T,) average over the spheres' supported volume; nan where there is none.
+        waypoint_max: (T,) largest average of any one sphere; nan likewise.
         waypoint_unsupported: (T,) share of the spheres' volume without support.
-        swept_total: integral of the entropy over the supported part of the volume that the spheres
-            sweep along the path, m^3 nats; every voxel counts once.
-        swept_mean: its average there, nats; nan if nothing is supported.
+        swept_total: integral over the supported part of the volume that the spheres sweep along the
+            path, m^3 nats; every voxel counts once.
+        swept_mean: its average there; nan if nothing is supported.
         swept_volume: all of the swept volume, m^3.
         unsupported_share: share of the swept volume without support.
-        resolution: edge of the voxels, metres. A voxel is swept if its centre is in some sphere at
-            some sampled configuration.
+        resolution: edge of the voxels, metres. One is swept if its centre is in some sphere at some
+            sampled configuration.
         spacing: largest motion between two samples, metres.
         configurations: samples on the path.
         voxels: voxels swept.
@@ -82,10 +81,9 @@ def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> 
     """Return the map's entropy along a path and over the volume it sweeps.
 
     Per waypoint 64 points in every sphere are asked; in the swept volume every voxel whose centre
-    some sphere covers, once. Edges are sampled so that nothing moves more than half a voxel between
-    samples: between two balls of radius r that leaves out a rim at most resolution^2 / (32 r) deep.
-    O(configurations x spheres x voxels per sphere) additions and one evaluation of the map per
-    voxel near its support.
+    some sphere covers, once. Nothing moves more than half a voxel between samples: between two
+    balls of radius r that leaves out a rim at most resolution^2 / (32 r) deep. O(configurations x
+    spheres x voxels per sphere) additions and one evaluation of the map per voxel near its support.
 
     Args:
         checker: a `CollisionChecker` over a `World`.

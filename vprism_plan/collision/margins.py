@@ -22,28 +22,24 @@ _CHUNK = 512  # configurations whose spheres are in memory at once
 
 @dataclass(frozen=True)
 class BodyMargin:
-    """Where one link and one obstacle are nearest to each other.
+    """Where one link and one obstacle are nearest to each other; metres, world frame.
 
     Attributes:
         link: the link.
-        body: the obstacle, named as in `Contact.body`.
-        kind: what it is.
-        clearance: lower bound of the distance between them (over all of a path), metres; negative
-            inside.
-        gradient: (dof,) change of the distance per radian or metre of each joint, at the
-            configuration where they are nearest, from the slope of the distance field; zeros where
-            that has none (in the middle of an obstacle).
-        nearest: point of the obstacle nearest to the sphere's centre, world, metres, to within a
-            voxel of the world's field (exact for half-spaces; rough from beyond the grid). From a
-            centre inside the obstacle: the nearest way out.
-        witness: point of the link's surface nearest to it, world, metres.
+        body: the obstacle, and ...
+        kind: ... what it is, as in `Contact`.
+        clearance: lower bound of the distance between them (over all of a path); negative inside.
+        gradient: (dof,) its change per radian or metre of each joint, from the slope of the
+            distance field; zeros where that has none (in the middle of an obstacle).
+        nearest: point of the obstacle nearest to the sphere's centre, to within a voxel (exact for
+            half-spaces; rough from beyond the grid). From inside the obstacle: the nearest way out.
+        witness: point of the link's surface nearest to it.
         sphere: the link's collision sphere on which `witness` lies.
         occupancy: the map's P(occupied) at `nearest`; None where the map has no say (support
             surface, known geometry).
         entropy: the map's entropy there, nats; None likewise.
         allowed: whether a contact rule lets this link touch this object.
-        place: where on the path: number of the edge plus the fraction of it; 0 for a single
-            configuration.
+        place: where on the path: number of the edge plus the fraction of it.
     """
 
     link: str
@@ -163,13 +159,10 @@ class Obstacle:
         return self.field.lower_bound(points)
 
     def nearest(self, points: Points) -> tuple[Points, Points]:
-        """Nearest points of the obstacle (of what is not the obstacle, from inside it), and the
-        unit directions in which the distance grows (0 where it has no slope).
-
-        One step down the slope of the nodes' distances, to within a voxel; from beyond the grid,
-        the nearest as seen from the grid's face. Directions are within a degree for most points, a
-        few degrees off within a voxel of an edge.
-        """
+        """Nearest points of the obstacle (from inside it, of what is not), and the unit directions
+        in which the distance grows (0 where it has no slope): one step down the slope of the nodes'
+        distances, to within a voxel; from beyond the grid, as seen from its face. Directions are
+        within a degree for most points, a few degrees off within a voxel of an edge."""
         if self.field is None:
             normal = np.tile(self.plane[:3], (len(points), 1))
             return points - self.bound(points)[:, None] * normal, normal
@@ -204,11 +197,9 @@ def _slope(field: DistanceField, points: Points) -> tuple[Values, Points]:
 
 
 def obstacles_of(world: Any, without: frozenset[int] = frozenset()) -> tuple[Obstacle, ...]:
-    """All obstacles of a `World`: half-spaces, then `world.sources` in order.
-
-    Objects `without` may be touched: occluded space inside them goes. Fields are baked on first
-    use: about half a second each for a table top at 1 cm, 6 bytes per node while the world lives.
-    """
+    """All obstacles of a `World`: half-spaces, then `world.sources`. Objects `without` may be
+    touched: occluded space inside them goes. Fields are baked on first use: about half a second
+    each for a table top at 1 cm, 6 bytes per node while the world lives."""
     planes = zip(world.plane_names, world.planes, strict=True)
     found = [Obstacle(name, source_of(name).kind, plane=row) for name, row in planes]
     for name in world.sources:
@@ -223,9 +214,8 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
 
     Each obstacle is asked by itself, so what stands behind something nearer is named, too. All
     clearances are lower bounds by the checker's own rules, and none is below `checker.clearance`
-    but by rounding. Along a path the edges are sampled so closely that no sphere moves more than
-    `tolerance` to the nearest sample, and that much is subtracted; for a tight bound over
-    everything ask `min_clearance`. Joint limits do not enter.
+    but by rounding. Along a path no sphere moves more than `tolerance` to the nearest sample, and
+    that much is subtracted; for a tight bound ask `min_clearance`. Joint limits do not enter.
 
     The first call bakes one distance field per obstacle (`obstacles_of`); after that a
     configuration costs milliseconds, a path O(configurations x spheres x bodies).
@@ -233,7 +223,7 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
     Args:
         checker: a `CollisionChecker` over a `World`.
         q_or_path: (dof,) or (T, dof) joint values, radians or metres.
-        tolerance: see above, metres; for a path only.
+        tolerance: metres; for a path only.
 
     Raises:
         RobotError: see `waypoints`; or the path is too long for the tolerance.

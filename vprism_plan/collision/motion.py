@@ -133,9 +133,8 @@ class PathClearance:
 
     Attributes:
         clearance: lower bound of the distance to the world at every point of the path.
-        tolerance: the smallest clearance of any configuration on the path lies at most this much
-            above `clearance`.
-        place: where the smallest clearance was found: number of the edge plus the fraction of it.
+        tolerance: the smallest clearance on the path lies at most this much above `clearance`.
+        place: where that was found: number of the edge plus the fraction of it.
         q: (dof,) that configuration; its clearance is `clearance + tolerance`.
         configurations: how many were computed.
         motion: upper bound of any sphere's way along the path.
@@ -169,8 +168,7 @@ class SafeMotion:
         fraction: the motion is valid from 0 up to this fraction of dq; 0 if q itself is refused.
         refused_at: a fraction, just after, at which it is refused; None if all of it is valid.
         tolerance: metres of motion. From `fraction` to `refused_at` nothing moves more than this,
-            nor from any point before `fraction` to a configuration that was found valid or is
-            proven so by its neighbours' clearances.
+            nor from any point before `fraction` to a configuration found valid or proven so.
         distance: upper bound of any sphere's way up to `fraction`, metres.
         reason: why it is refused at `refused_at`; None if it is not.
         configurations: how many were checked.
@@ -209,12 +207,9 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
     Branch and bound over intervals of edges. If no sphere can move more than m from the middle of
     an interval to anywhere in it, the distance there is at least c - m, where c is the middle's
     clearance: distances are 1-Lipschitz and c is a lower bound. An interval is closed when that
-    exceeds what is found elsewhere less the tolerance, or when m is at most the tolerance;
-    otherwise its halves are asked. So no configuration on the path is nearer to anything than
-    `clearance`.
-
-    Computed clearances are bounds, which drop by up to a voxel between neighbours: intervals are
-    closed early only if they could not come in under the answer even so.
+    exceeds what is found elsewhere less the tolerance (by a voxel: computed clearances are bounds,
+    which drop by up to one between neighbours), or when m is at most the tolerance; otherwise its
+    halves are asked.
 
     Args:
         checker: a `CollisionChecker`.
@@ -264,17 +259,14 @@ def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.
     Conservative advancement: from a configuration with clearance c (less the margin) and self gap g
     the motion cannot be refused before something moves by them. Where they are within a voxel of
     what is required, or `max_risk` is set (of which no such bound exists), it goes on in steps of
-    at most `tolerance` metres of motion and asks each. What is refused first is then bracketed by
+    at most `tolerance` metres of motion and asks each. What is refused first is bracketed by
     halving.
 
     Args:
         checker: a `CollisionChecker`.
         q: (dof,) where the motion starts.
         dq: (dof,) change of the joints over the whole motion; no joint is wrapped.
-        tolerance: metres of motion.
-
-    Raises:
-        RobotError: a shape is wrong, a value is not finite, or the tolerance is too small.
+        tolerance: metres of motion, or RobotError if it is too small.
     """
     checked_tolerance(tolerance)
     march = _March(checker, q, dq, tolerance)

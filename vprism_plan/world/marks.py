@@ -34,10 +34,6 @@ CELLS = 2  # cells per grid step for everything that is seen or not seen
 class Evidence:
     """What the views of a map say of space: what was seen, what hides, where nobody looked.
 
-    Args:
-        map_: the map.
-        config: policies, and what counts as seen.
-
     Attributes:
         views: ready to be asked of cells.
         below: the same for which the support plane hides things, too; None if it never ends.
@@ -73,16 +69,10 @@ class Evidence:
     def marks(
         self, occluded: OccludedPolicy, grid: Grid, objects: Nodes | None, inner: Grid | None = None
     ) -> Lattice:
-        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no object
-        of the map holds.
-
-        Args:
-            occluded: what to do with occluded space.
-            grid: nodes of the field; the marks are `CELLS` times finer.
-            objects: distance from its nodes to the level set, metres; None marks all that was seen
-                of the objects.
-            inner: another grid whose box is not to be marked.
-        """
+        """Mark, `CELLS` times finer than the grid, occluded (by that policy) and unobserved cells
+        outside the box of `inner`, and seen surfaces that no object of the map holds, by the
+        distance of the grid's nodes to the level set (metres); all that was seen of the objects, if
+        that is not given."""
         spacing = grid.spacing / CELLS
         cells = tuple(CELLS * (n - 1) for n in grid.shape)
         shape = (cells[0], cells[1], cells[2])

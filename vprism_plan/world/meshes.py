@@ -114,16 +114,9 @@ def extract_refined_meshes(
     Objects are those of `extract_meshes`. A grid of spacing * 2^halvings is evaluated wholly; cells
     in which the surface runs, and at first their neighbours, are halved until they have the
     spacing. What is smaller than the first grid and touches none of its nodes is not found. An
-    object of which nothing is found is left out, with a warning.
-
-    Args:
-        map, level: as there.
-        spacing: edge of the marching cubes, metres.
-        halvings: how often cells are halved, up to 8; None takes the coarsest first grid that is no
-            wider than half a kernel length.
-
-    Raises:
-        WorldError: a surface could not be closed.
+    object of which nothing is found is left out, with a warning. `halvings` may be up to 8; None
+    takes the coarsest first grid that is no wider than half a kernel length. WorldError if one
+    could not be closed.
     """
     check_level(level)
     check_spacing(spacing, "spacing")

@@ -174,15 +174,12 @@ class PosteriorWorlds:
     def touched(
         self, centers: Points, radii: Any, without: Collection[int] = ()
     ) -> Bool[np.ndarray, "n s"]:
-        """Return in which draws each ball touches an occupied voxel.
+        """Return in which draws each ball (centres in the world, one radius or each its own,
+        metres) touches an occupied voxel; objects `without` may be touched. Never misses a voxel
+        centre inside a ball.
 
-        Never misses a voxel centre inside a ball. The probability that a body swept along a path
-        touches anything is `touched(...).any(axis=0).mean()`.
-
-        Args:
-            centers: world, metres.
-            radii: of all balls, or of each (n,), metres.
-            without: ids of objects that may be touched.
+        The probability that a body swept along a path touches anything is
+        `touched(...).any(axis=0).mean()`.
 
         Raises:
             WorldError: not finite, a radius that `reach` does not cover, an unknown object.

@@ -20,18 +20,7 @@ from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points
 from vprism_plan.world.config import WorldConfig
-from vprism_plan.world.grid import (
-    Balls,
-    Chosen,
-    Image,
-    Mask,
-    Points,
-    Shape3,
-    Slices,
-    Values,
-    Vector,
-    window,
-)
+from vprism_plan.world.grid import Balls, Chosen, Image, Points, Values, Vector, window
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
 _NEAR = 0.1
@@ -48,7 +37,9 @@ def free_balls(observations: Iterable[Observation]) -> Balls:
     return np.concatenate(found)
 
 
-def speaking_against(observation: Observation, things: Mask, balls: Balls) -> Image:
+def speaking_against(
+    observation: Observation, things: Bool[np.ndarray, "h w"], balls: Balls
+) -> Image:
     """Depth (metres) of the pixels behind which the balls are not believed, inf elsewhere: what
     of the things (neither robot nor support surface) shows something within 10 cm of a ball of
     any view, and all that shows the same object."""
@@ -61,19 +52,6 @@ def speaking_against(observation: Observation, things: Mask, balls: Balls) -> Im
         objects = np.unique(observation.labels[near])
         near |= things & np.isin(observation.labels, objects[objects > 0])
     return np.where(near, np.asarray(observation.depth, dtype=np.float64), np.inf)
-
-
-def cells_within(
-    balls: Balls, origin: Vector, spacing: float, shape: Shape3
-) -> tuple[Slices, Bool[np.ndarray, "x y z"]]:
-    """Part of a lattice around the balls, and its cells that lie wholly in one of them."""
-    low = np.floor(((balls[:, :3] - balls[:, 3:]).min(axis=0) - origin) / spacing)
-    high = np.ceil(((balls[:, :3] + balls[:, 3:]).max(axis=0) - origin) / spacing)
-    low = np.clip(low, 0, shape).astype(np.int64)
-    high = np.clip(high, low, shape).astype(np.int64)
-    marked = np.zeros(tuple(high - low), dtype=bool)
-    kernels.mark_cells_within(balls, origin + spacing * low, spacing, marked)
-    return window(low, high), marked
 
 
 # Codes of points, and the names of space that nobody has seen.
@@ -160,7 +138,7 @@ def make_view(
     return replace(view, robot=own, against=tables)
 
 
-def _view(observation: Observation, reach: Image, valid: Mask) -> View:
+def _view(observation: Observation, reach: Image, valid: Bool[np.ndarray, "h w"]) -> View:
     K, rotation = observation.intrinsics, observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
     return View(
@@ -183,7 +161,7 @@ def classify_cells_around(
     plane: Plane,
     origin: Vector,
     spacing: float,
-    shape: Shape3,
+    shape: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """`classify_cells` for a support plane that ends somewhere: above it as `views` say, for
     which it casts no shadow; below, wherever a cell reaches there, as the `below` views say, for
@@ -200,7 +178,11 @@ def classify_cells_around(
 
 
 def classify_cells(
-    views: Sequence[View], plane: Plane | None, origin: Vector, spacing: float, shape: Shape3
+    views: Sequence[View],
+    plane: Plane | None,
+    origin: Vector,
+    spacing: float,
+    shape: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """Status of every cell of a lattice: FREE, OCCLUDED, PARTLY or UNOBSERVED (`kernels`).
 
@@ -245,12 +227,15 @@ def _clear_robots(
     balls = robot_balls(views)
     if not len(balls):
         return
-    near, robot = cells_within(balls, origin, spacing, status.shape)
-    part = status[near]
+    low = np.floor(((balls[:, :3] - balls[:, 3:]).min(axis=0) - origin) / spacing)
+    high = np.ceil(((balls[:, :3] + balls[:, 3:]).max(axis=0) - origin) / spacing)
+    low = np.clip(low, 0, status.shape).astype(np.int64)
+    part = status[window(low, np.clip(high, low, status.shape))]
+    corner, robot = origin + spacing * low, np.zeros(part.shape, dtype=bool)
+    kernels.mark_cells_within(balls, corner, spacing, robot)
     robot &= part != kernels.FREE
     if not robot.any():
         return
-    corner = origin + spacing * np.array([w.start for w in near])
     for view in views:
         if view.against is not None:
             code = np.full(part.shape, kernels.UNOBSERVED, dtype=np.uint8)
@@ -299,7 +284,7 @@ def clutter_pixels(
     height: float,
     lone_share: float = 0.0,
     bounded: bool = False,
-) -> Mask:
+) -> Bool[np.ndarray, "h w"]:
     """Which pixels show unlabelled things off the support plane.
 
     "Off" is `height` metres, or three standard deviations of the depth noise along the normal, if

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from vprism_plan.errors import WorldError
 from vprism_plan.world import visibility
-from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, Primitive, WorldConfig
+from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
@@ -223,7 +223,7 @@ class World:
         distance, label = distance_to_lattice(lattice, self.grid)
         return NodeDistances(distance, label.astype(np.int16) - np.int16(1))
 
-    def _known_distances(self, solids: list[Primitive | KnownMesh]) -> list[NodeDistances]:
+    def _known_distances(self, solids: list[Any]) -> list[NodeDistances]:
         parts = []
         for item in solids:
             name = f"known:{item.name}"
@@ -271,15 +271,13 @@ class World:
     def certain_field(
         self, without: Collection[int] = (), level_set: bool = False, seen: bool = False
     ) -> DistanceField:
-        """Distance to what is an obstacle whatever the posterior says.
-
-        Background, seen parts that the level set misses, known geometry, unobserved space by its
-        policy, and occluded space where the map has too little support to judge (unless the policy
-        is "free"). The rest is for `posterior_worlds` to say; with `level_set`, the objects where
-        P(occupied) >= level belong to it as well. The objects `without`, and their seen parts, are
-        left out. With `seen`, so does whatever was seen of an object, wherever the level set is.
-        WorldError if the map has no such object.
-        """
+        """Distance to what is an obstacle whatever the posterior says: background, seen parts that
+        the level set misses, known geometry, unobserved space by its policy, and occluded space
+        where the map has too little support to judge (unless the policy is "free"). The rest is for
+        `posterior_worlds` to say; with `level_set`, the objects where P(occupied) >= level belong
+        to it as well. The objects `without`, and their seen parts, are left out. With `seen`, so
+        does whatever was seen of an object, wherever the level set is. WorldError if the map has no
+        such object."""
         gone = frozenset(classes_of(self.map, without))
         key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
         if key not in self._cache:
@@ -301,15 +299,10 @@ class World:
 
         At no node is it below `field`, so neither are the bounds between nodes; the smallest over
         all sources is `field` wherever that is positive, less the end of what was judged, metres
-        away. An object's own field holds its level set and its seen surfaces off it.
-
-        Args:
-            name: one of `sources`, or WorldError.
-            without: objects whose part of the occluded space, and of cells they share with this
-                obstacle, is left out, as `fields_without` does; nothing is, of their own.
-
-        Returns:
-            The field; its `source` is -1 everywhere if there is no such obstacle.
+        away. An object's own field holds its level set and its seen surfaces off it. Of the objects
+        `without` the part of the occluded space, and of cells they share with this obstacle, is
+        left out, as `fields_without` does; nothing is, of their own. `source` is -1 everywhere if
+        there is no such obstacle.
         """
         if name not in self.sources:
             raise WorldError(f"no source {name!r} in this world; it has {', '.join(self.sources)}")

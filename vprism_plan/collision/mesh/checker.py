@@ -41,20 +41,20 @@ class MeshChecker(explain.Checker):
     surface and known half-spaces (by formula), known primitives and meshes, self-collision of the
     pairs the robot tests, and joint limits; and, by the images alone, every observed point off the
     support surface (a ball of half its pixel's width) and, as the world's policies say, hidden
-    space. Of hidden space it asks one point per 3 cm cube of the solids' surfaces, so a shadow
-    narrower than that can be missed.
+    space. Of that it asks one point per 3 cm cube of the solids' surfaces: a narrower shadow can be
+    missed.
 
     The robot is what the URDF has, scaled if the robot was scaled, whatever its spheres are. Its
     padding is a distance to keep from the world, beside `config.margin`.
 
     FCL's meshes are hollow. A solid that no surface cuts lies wholly on one side, and the map's
     level set at one of its points says which (for known meshes: the winding number). Links that no
-    joint moves are not checked against the world: they stand on it. Touching counts as collision.
-    FCL's own tolerance is about 1e-5 m.
+    joint moves are not checked against the world. Touching counts as collision; FCL's own tolerance
+    is about 1e-5 m. Bounds are compared first, and FCL is asked only about pairs whose bounds meet.
 
-    It answers the questions of `CollisionChecker` by the same names and can be given to `plan` in
-    its place, some hundred times slower, with edges checked at discrete configurations. Not safe to
-    share between threads: shapes are moved while they are asked about.
+    It can be given to `plan` in place of a `CollisionChecker`, some hundred times slower, with
+    edges checked at discrete configurations. Not safe to share between threads: shapes are moved
+    while they are asked about.
 
     Args:
         world: what to avoid.
@@ -64,8 +64,7 @@ class MeshChecker(explain.Checker):
         links: "geometry": the URDF's meshes, boxes, cylinders and spheres, or `link_meshes`, and
             the collision spheres of links that have neither (or whose meshes are missing, or in
             more than 20 pieces). "spheres": the collision spheres of every link.
-        link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres, in place of its
-            primitives.
+        link_meshes: link -> `trimesh.Trimesh` in the link's frame, metres, for its primitives.
         resolution: edge of the objects' marching cubes, metres. None: the lattice of the world's
             distance field (a quarter of its resolution), on which no mesh reaches beyond what the
             field encloses. A coarser mesh is made sooner, and may.
@@ -125,15 +124,9 @@ class MeshChecker(explain.Checker):
 
     @classmethod
     def like(cls, checker: Any, **options: Any) -> "MeshChecker":
-        """Make the second opinion on a `CollisionChecker`: its world, robot, margins and rules.
-
-        What its edges may miss (`config.tolerance`) is taken off the margins: paths are shaved down
-        to them.
-
-        Args:
-            checker: a `CollisionChecker`.
-            **options: as for `MeshChecker`.
-        """
+        """Make the second opinion on a `CollisionChecker`: its world, robot, margins and rules,
+        with `options` of `MeshChecker`. What the checker's edges may miss (`config.tolerance`) is
+        taken off the margins: paths are shaved down to them."""
         config = checker.config
         margins = {
             name: max(0.0, getattr(config, name) - config.tolerance)
@@ -296,15 +289,9 @@ class MeshChecker(explain.Checker):
         )
 
     def check_path(self, path: Numbers) -> PathOpinion:
-        """Check every edge of a path (T, dof) as `check_motion` does.
-
-        Returns:
-            The opinion, with the first collision found on each refused edge.
-
-        Raises:
-            RobotError: path does not have shape (T, dof), T >= 1, or is not finite.
-            ConfigError: the step asks for too many configurations.
-        """
+        """Check every edge of a path (T, dof) as `check_motion` does, and return the first
+        collision found on each refused one; RobotError without a waypoint, or if one is not
+        finite."""
         rows = configurations(self.robot, path, finite=True)
         if len(rows) == 0:
             raise RobotError(f"a path has shape {rows.shape}; it needs at least one waypoint")

@@ -194,11 +194,8 @@ def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
         Q: (n, dof) finite configurations.
 
     Returns:
-        The comparison. A disagreement has one cause per contact of the checker that refuses: each
-        of them alone would have made the difference.
-
-    Raises:
-        RobotError: Q does not have shape (n, dof) or is not finite.
+        A disagreement has one cause per contact of the checker that refuses: each of them alone
+        would have made the difference.
     """
     both, neither, found = 0, 0, []
     for index, q in enumerate(configurations(mesh_checker.robot, Q, finite=True)):
@@ -295,8 +292,9 @@ def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> C
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
         kind = "unexplained"  # a joint limit: both know the same
-    elif contact.kind == "object" and object_id(contact.body) in checker.allowed_objects(
-        checker.robot.link_names.index(contact.link)
+    elif contact.kind == "object" and any(
+        object_id(contact.body) in ids and contact.link in checker.robot.links_of(name)
+        for name, ids in checker.config.allowed_contacts.items()
     ):
         kind = "contact rules"
     elif contact.kind == "object" and contact.detail != SEEN and draws_judge:
