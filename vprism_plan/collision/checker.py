@@ -39,11 +39,8 @@ class CollisionChecker(explain.Checker):
     A configuration is valid when its joints are within their limits, every collision sphere of
     every moving link keeps more than `config.margin` from the world, and every link pair that may
     collide keeps more than `config.self_margin`. All distances are lower bounds, so an error can
-    only refuse. Links that no joint moves are not checked against the world: they stand on it.
-
-    `config.allowed_contacts` lets links touch chosen objects; `config.max_risk` bounds the
-    probability of collision (see `CheckerConfig`): in place of the level set, or beside it where
-    the bound is below the world's `level`.
+    only refuse. Links that no joint moves are not checked against the world: they stand on it. See
+    `CheckerConfig` for `allowed_contacts` and `max_risk`.
 
     Construction compiles the kernels if they are not cached on disk (some twenty seconds, once per
     machine). Safe to share between threads; the kernels release the GIL. Single queries cost a
@@ -51,12 +48,12 @@ class CollisionChecker(explain.Checker):
     bounding spheres come near something.
 
     Args:
-        world: What to avoid: a `vprism_plan.World`, or anything that has its `field` (origin,
-            spacing, distance and source at nodes), `planes`, `plane_names`, `sources`, `config`
-            (the policies `occluded` and `unobserved`), `map.occupancy(points)` and
-            `status(points)`. Contact rules and probabilities need a `World`.
-        robot: Whose configurations are asked about: a `vprism_plan.Robot`.
-        config: Margins and tolerances.
+        world: a `vprism_plan.World`, or anything that has its `field` (origin, spacing, distance
+            and source at nodes), `planes`, `plane_names`, `sources`, `config` (the policies
+            `occluded` and `unobserved`), `map.occupancy(points)` and `status(points)`. Contact
+            rules and probabilities need a `World`.
+        robot: a `vprism_plan.Robot`.
+        config: margins and tolerances.
     """
 
     def __init__(self, world: Any, robot: Any, config: CheckerConfig | None = None) -> None:
@@ -137,10 +134,10 @@ class CollisionChecker(explain.Checker):
     def clearance(self, q: Numbers) -> float:
         """Return a lower bound of the distance from the robot to the world, metres.
 
-        Negative when a sphere reaches into the level set, the table, known geometry or whatever
-        else the world's policies make an obstacle. The margin is not subtracted, and self-collision
-        and joint limits do not enter. It is measured to the level set also when `max_risk` decides
-        what is valid; a link's allowed contacts do not count. RobotError if q is not finite.
+        Negative when a sphere reaches into what the world makes an obstacle. The margin is not
+        subtracted, and self-collision and joint limits do not enter. It is measured to the level
+        set also when `max_risk` decides what is valid; a link's allowed contacts do not count.
+        RobotError if q is not finite.
         """
         return float(self._clearances(configuration(self.robot, q)[None])[0][0])
 
@@ -285,21 +282,17 @@ class CollisionChecker(explain.Checker):
         return self.config.max_risk
 
     def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
-        """Return the probability that a path (or a configuration) touches anything.
+        """Return the probability that a path (T, dof), or a configuration (dof,), touches anything.
 
         The share of worlds, drawn from the map's posterior, in which any sphere of any moving link
         touches an occupied voxel that it may not touch, or a certain obstacle, anywhere on the
         path: the same world for the whole path. Edges are straight in joint space and swept without
-        gaps. Margin, self-collision and joint limits do not enter.
+        gaps. Margin, self-collision and joint limits do not enter. RobotError as for
+        `packing.waypoints`.
 
-        Args:
-            path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
-            held_out: ask other worlds than those that `max_risk` is checked with. A path that a
-                planner found with this checker was selected by the worlds it was checked with, so
-                their verdict on it is too mild.
-
-        Raises:
-            RobotError: see `packing.waypoints`.
+        With `held_out` other worlds are asked than those that `max_risk` is checked with: a path
+        that a planner found with this checker was selected by those, so their verdict on it is too
+        mild.
         """
         rows = waypoints(self.robot, path, single=True)
         risk = self._risk()

@@ -14,29 +14,26 @@ from vprism_plan.errors import ConfigError
 
 @dataclass(frozen=True)
 class CheckerConfig:
-    """Settings of a `CollisionChecker`.
+    """Settings of a `CollisionChecker`; lengths in metres.
 
     Attributes:
-        margin: Clearance, metres, that every sphere must keep from the world beyond touching it; 0
-            means that only contact is refused.
-        self_margin: The same between the links of the robot, metres.
-        min_motion: Edges are certified continuously until no sphere can move more than this,
-            metres, between two checked configurations. A point of such a gap is at most half of it
-            away from a configuration known to be free: that half is the tolerance of
-            `check_motion`.
-        max_risk: Bound on the probability of collision. With a bound, the objects of the map (and
-            occluded space where the map has support) are judged by worlds drawn from its posterior
-            instead of by the level set, at P(occupied) = 1/2 of each draw whatever
-            `WorldConfig.level` is: a configuration or an edge is free if the upper confidence bound
-            of its probability of coming within `margin` is at most `max_risk`. Everything else is
-            refused as without a bound, and so is the level set if `max_risk` is below its level:
-            draws are counted by voxels, and alone would let a path shave a surface that was seen.
-            None: level set.
-        allowed_contacts: Link or SRDF group -> ids of the objects it may touch; for example
+        margin: clearance that every sphere must keep from the world beyond touching it.
+        self_margin: the same between the links of the robot.
+        min_motion: edges are certified continuously until no sphere can move more than this between
+            two checked configurations. A point of such a gap is at most half of it away from a
+            configuration known to be free: the tolerance of `check_motion`.
+        max_risk: bound on the probability of collision. With a bound, the objects of the map (and
+            occluded space where the map has support) are judged by worlds drawn from its posterior,
+            at P(occupied) = 1/2 of each draw whatever `WorldConfig.level` is: a configuration or an
+            edge is free if the upper confidence bound of its probability of coming within `margin`
+            is at most `max_risk`. Everything else is refused as without a bound, and so is the
+            level set if `max_risk` is below its level: draws are counted by voxels, and alone would
+            let a path shave a surface that was seen. None: level set.
+        allowed_contacts: link or SRDF group -> ids of the objects it may touch; for example
             {"hand": {3}}. What a link may touch, it may also pass through.
-        n_worlds: Worlds drawn for probabilities, a multiple of 64.
-        risk_seed: Seed of the draws.
-        confidence: Of the interval of a probability, two-sided.
+        n_worlds: worlds drawn for probabilities, a multiple of 64.
+        risk_seed: seed of the draws.
+        confidence: of the interval of a probability, two-sided.
     """
 
     margin: float = 0.0

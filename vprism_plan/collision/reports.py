@@ -27,24 +27,23 @@ def as_point(values: Vector) -> Point:
 
 @dataclass(frozen=True)
 class Contact:
-    """One reason why a configuration is refused.
+    """One reason why a configuration is refused; metres, world frame.
 
     Attributes:
         kind: What the link touches.
         link: Link that touches (for a joint limit: the joint).
         body: Name of what is touched (see `world.sources`), another link, or the limit.
-        depth: How far the clearance falls short of what is required, metres (for a joint limit: how
-            far outside, radians or metres; for a risk: by how much its upper bound exceeds
-            `max_risk`).
+        depth: How far the clearance falls short of what is required (for a joint limit: how far
+            outside, radians or metres; for a risk: by how much its upper bound exceeds `max_risk`).
         sphere: Index of the collision sphere, or -1.
-        position: Point of contact, world frame, metres.
-        normal: Unit direction that leads out of the contact, world frame.
+        position: Point of contact.
+        normal: Unit direction that leads out of the contact.
         probability: Largest P(occupied) of the map inside the sphere (for a risk: the share of the
             posterior worlds in which this link touches this body); None where the cause is not the
             map's to judge (self, limits, known geometry).
         detail: The rule that decided, in words.
-        required: Distance that was asked for, metres: the margin and the link's padding. So
-            `required - depth` is how far apart the two are, negative where they overlap.
+        required: Distance that was asked for: the margin and the link's padding. So `required -
+            depth` is how far apart the two are, negative where they overlap.
     """
 
     kind: Kind
@@ -183,8 +182,8 @@ class RiskEstimate:
         lower: Clopper-Pearson bound of the worlds that occupy a voxel's centre inside a sphere,
             less what skipping certain voxels may add.
         upper: Clopper-Pearson bound of the worlds with a voxel whose corners a sphere reaches, and
-            what skipping certain voxels may hide; above 0 even if no world collides. Verdicts with
-            `max_risk` go by it.
+            what skipping certain voxels may hide; above 0 even if no world collides. `max_risk`
+            goes by it.
         confidence: of the interval (lower, upper), two-sided; it holds the size of voxels.
         n_worlds: worlds drawn.
         seed: of the draws.
@@ -192,10 +191,10 @@ class RiskEstimate:
         certain: whether the path hits what is an obstacle in every world: support surface,
             background, unseen space by policy, known geometry.
         spacing: no sphere centre moves more than this between two samples, metres; what lies
-            between samples is covered by growing the spheres.
-        configurations: samples taken.
-        trace, volume: find `first_contact` and `shares`, which cost more than the rest and are
-            often not asked for.
+            between is covered by growing the spheres.
+        configurations: samples on the path.
+        trace, volume: find `first_contact` and `shares`, which cost more and are often not asked
+            for.
     """
 
     probability: float

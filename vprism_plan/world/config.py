@@ -191,17 +191,17 @@ class WorldConfig:
         resolution: distance between the nodes of the distance field.
         level: the objects are {x : P(occupied)(x) >= level}.
         occluded: what to do with space that a camera's ray would reach only through something it
-            saw. "occupied" (default): it is an obstacle, also where the map's kernels reach. A
-            posterior that extrapolates "empty" a centimetre into a shadow can never make a hidden
-            object touchable. "posterior": where the map has support (kernel mass >= `min_support`)
-            the posterior decides; elsewhere it is an obstacle. "free": only the posterior decides.
+            saw. "occupied" (default): it is an obstacle, also where the map's kernels reach: a
+            posterior that extrapolates "empty" into a shadow can never make a hidden object
+            touchable. "posterior": where the map has support (kernel mass >= `min_support`) the
+            posterior decides; elsewhere it is an obstacle. "free": only the posterior decides.
         unobserved: the same for space outside every image or behind pixels without a depth return:
             "free" (default) or "occupied". Space outside the grid counts as unobserved.
         support: how far the support surface goes on. "unbounded": everything below its plane is an
             obstacle. "seen": only below the convex hull of what was seen of it and 5 cm around;
             what else lies lower is judged like all other space. "auto" (default): "seen" for a
-            robot whose base stands more than 5 cm below the plane, which its `CollisionChecker`
-            then says, else "unbounded".
+            robot whose base stands more than 5 cm below the plane, which its checker then says,
+            else "unbounded".
         bounds: (lower, upper) corners of the box that the grid must cover at least; None chooses
             the observed objects' box and room around it. The grid always covers the whole level set
             and all known geometry.
@@ -217,7 +217,7 @@ class WorldConfig:
             nothing as thick as a 1 mm rod.
 
     Raises:
-        ConfigError: a value outside its range; the message names it and the range.
+        ConfigError: a value outside its range.
     """
 
     resolution: float = 0.01

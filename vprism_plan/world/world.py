@@ -402,14 +402,10 @@ class World:
         return (*getattr(self.map, "warnings", ()), *self._said)
 
     def for_base(self, base: Vector) -> "World":
-        """Return the world for a robot whose base stands there (world, metres).
-
-        This world, or with `support="auto"` and a base more than 5 cm below the support plane one
-        whose support surface ends where it was seen to end; baked once.
-
-        Raises:
-            PlaneNotFoundError: too little of the surface was seen to say where that is.
-        """
+        """Return the world for a robot whose base stands there (world, metres): this one, or with
+        `support="auto"` and a base more than 5 cm below the support plane one whose support surface
+        ends where it was seen to end; baked once. PlaneNotFoundError if too little was seen to say
+        where."""
         plane = self.map.plane
         if self.config.support != "auto" or plane is None:
             return self
