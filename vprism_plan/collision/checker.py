@@ -217,9 +217,12 @@ class CollisionChecker(explain.Checker):
         """Return every reason to refuse q: the deepest contact of each link and body first,
         what `max_risk` refuses last."""
         q = configuration(self.robot, q)
-        found = [*explain.world_contacts(self, q), *explain.self_contacts(self, q)]
-        found += explain.limit_contacts(self.robot, q)
-        return (*explain.by_depth(found), *self._risk_contacts(q))
+        limits, bounded = explain.limit_contacts(self.robot, q), self._bounded
+        if not np.isfinite(q).all():
+            return tuple(limits)
+        found = [*explain.world_contacts(self, q), *explain.self_contacts(self, q), *limits]
+        risky = bounded is not None and not bounded.accepts_one(q)
+        return (*explain.by_depth(found), *(bounded.contacts(q) if bounded and risky else ()))
 
     def _permitted(self, q: Configuration) -> list[Contact]:
         return explain.allowed_contacts(self, q)
@@ -319,9 +322,3 @@ class CollisionChecker(explain.Checker):
     def risk_setting(self) -> Setting:
         """Return what probabilities are counted with, for planners' objectives."""
         return self._risk().setting
-
-    def _risk_contacts(self, q: Configuration) -> tuple[Contact, ...]:
-        bounded = self._bounded
-        if bounded is None or bounded.accepts_one(q):
-            return ()
-        return bounded.contacts(q)

@@ -16,7 +16,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.world import visibility
 from vprism_plan.world.config import KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import Lattice, bounding, lattice_nodes
-from vprism_plan.world.grid import Grid, Nodes, Points, Shape3, Values, Vector, corners, window
+from vprism_plan.world.grid import Grid, Nodes, Points, Values, Vector, corners, window
 from vprism_plan.world.seen import (
     Cone,
     Surface,
@@ -78,7 +78,13 @@ class Evidence:
         shape = (cells[0], cells[1], cells[2])
         nodes = np.zeros(tuple(n + 1 for n in shape), dtype=np.uint8)
         if occluded != "free" or self._config.unobserved != "free":
-            status = self._status(occluded, grid.origin, spacing, shape)
+            place = self._map.plane, grid.origin, spacing, shape
+            if self.below is None:
+                status = visibility.classify_cells(self.views, *place)
+            else:
+                status = visibility.classify_cells_around(self.views, self.below, *place)
+            if occluded == "posterior":
+                _trust_posterior(self._map, self._config, status, grid.origin, spacing)
             if inner is not None:
                 # Cells that lie wholly inside the other box.
                 low = np.ceil((inner.origin - grid.origin) / spacing - 1e-9)
@@ -103,19 +109,6 @@ class Evidence:
                 points[kept], half[kept], grid.origin, spacing, np.uint8(label), nodes
             )
         return Lattice(nodes, grid.first * CELLS, CELLS)
-
-    def _status(
-        self, occluded: OccludedPolicy, origin: Vector, spacing: float, shape: Shape3
-    ) -> UInt8[np.ndarray, "nx ny nz"]:
-        """What the views say of cells, and, where it decides, the posterior."""
-        place = self._map.plane, origin, spacing, shape
-        if self.below is None:
-            status = visibility.classify_cells(self.views, *place)
-        else:
-            status = visibility.classify_cells_around(self.views, self.below, *place)
-        if occluded == "posterior":
-            _trust_posterior(self._map, self._config, status, origin, spacing)
-        return status
 
     def _seen(self, grid: Grid, objects: Nodes | None, step: float) -> Iterator[Surface]:
         """Marks, points and half the widths of what was seen, the less important first."""

@@ -45,19 +45,13 @@ CAUSES: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Cause:
-    """Why one contact is refused by one checker and not by the other.
+    """Why one contact is refused by one checker and not by the other."""
 
-    Attributes:
-        kind: the cause.
-        link: link in contact.
-        body: what it touches.
-        amount: metres: how far the solids stay from the surface ("conservative spheres"), the
-            spheres do ("margin", "voxel inflation"), or the depth of the contact.
-    """
-
-    kind: str
-    link: str
-    body: str
+    kind: str  # the cause
+    link: str  # link in contact
+    body: str  # what it touches
+    # metres: how far the solids stay from the surface ("conservative spheres"), the spheres do
+    # ("margin", "voxel inflation"), or the depth of the contact
     amount: float
 
     def text(self) -> str:
@@ -67,19 +61,12 @@ class Cause:
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A configuration on which two checkers disagree.
+    """A configuration on which two checkers disagree."""
 
-    Attributes:
-        index: row of the configurations that were compared.
-        field_valid: verdict of the checker on the distance field.
-        mesh_valid: verdict of the checker on meshes.
-        causes: one per contact of the checker that refuses, deepest first.
-    """
-
-    index: int
-    field_valid: bool
-    mesh_valid: bool
-    causes: tuple[Cause, ...]
+    index: int  # row of the configurations that were compared
+    field_valid: bool  # verdict of the checker on the distance field
+    mesh_valid: bool  # verdict of the checker on meshes
+    causes: tuple[Cause, ...]  # one per contact of the checker that refuses, deepest first
 
 
 @dataclass(frozen=True)
@@ -122,21 +109,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class PathFinding:
-    """A collision on an edge of a path.
+    """A collision on an edge of a path."""
 
-    Attributes:
-        edge: number of the edge; edge 0 leads from waypoint 0 to waypoint 1.
-        fraction: where on the edge, 0 to 1; the first of the configurations looked at.
-        configuration: the joint values there.
-        contacts: what touches what.
-        causes: why another checker accepted it, if one was named.
-    """
-
-    edge: int
-    fraction: float
-    configuration: tuple[float, ...]
-    contacts: tuple[Contact, ...]
-    causes: tuple[Cause, ...] = ()
+    edge: int  # number of the edge; edge 0 leads from waypoint 0 to waypoint 1
+    fraction: float  # where on the edge, 0 to 1; the first of the configurations looked at
+    configuration: tuple[float, ...]  # the joint values there
+    contacts: tuple[Contact, ...]  # what touches what
+    causes: tuple[Cause, ...] = ()  # why another checker accepted it, if one was named
 
     def text(self) -> str:
         """Return the finding in one line."""
