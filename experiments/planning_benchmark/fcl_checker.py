@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan.collision import CheckerConfig, CollisionChecker, MeshChecker
-from vprism_plan.collision.inputs import Numbers
+from vprism_plan.collision.packing import Numbers
 from vprism_plan.robots import Robot
 from vprism_plan.world import World
 

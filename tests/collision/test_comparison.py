@@ -2,7 +2,6 @@
 """Where field and meshes disagree: a constructed case of every kind, and one that never is."""
 
 from types import SimpleNamespace
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from oracles.world_oracles import KernelMap, random_map
 import vprism_plan as vp
 from vprism_plan.collision import compare
 from vprism_plan.collision.mesh.comparison import (
+    CAUSES,
     Cause,
-    CauseKind,
     Comparison,
     PathFinding,
     PathOpinion,
@@ -23,7 +22,7 @@ from vprism_plan.errors import RobotError
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scenes import Scene
 from vprism_plan.simulation.solids import Box
-from vprism_plan.world.known import HalfSpace, Sphere
+from vprism_plan.world.config import HalfSpace, Sphere
 
 SLIDER = """<robot name="slider">
   <link name="world"/><link name="x"/><link name="y"/>
@@ -354,7 +353,7 @@ def test_both_free_or_both_refused_is_no_disagreement(blob, ball_robot):
 
 
 def test_every_kind_can_be_spoken():
-    for kind in get_args(CauseKind):
+    for kind in CAUSES:
         assert kind in Cause(kind, "ball", "object:1", 0.01).text()
     opinion = PathOpinion(False, 0.005, 3, (PathFinding(1, 0.25, (0.0,), ()),))
     assert "edge 1 at 0.250" in opinion.text()

@@ -11,8 +11,8 @@ from oracles.checker_oracle import BallWorld
 
 from vprism_plan._kernels import checking as kernels
 from vprism_plan.collision import CollisionChecker
-from vprism_plan.collision.inputs import AT_MOST
 from vprism_plan.collision.motion import edges_of
+from vprism_plan.collision.packing import AT_MOST
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import Robot
 

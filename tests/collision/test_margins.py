@@ -17,8 +17,7 @@ from vprism_plan.collision.motion import sphere_jacobians
 from vprism_plan.errors import RobotError, WorldError
 from vprism_plan.perception import Plane
 from vprism_plan.world import World, WorldConfig
-from vprism_plan.world.known import Box, Cylinder, HalfSpace, Sphere
-from vprism_plan.world.source_fields import source_field
+from vprism_plan.world.config import Box, Cylinder, HalfSpace, Sphere
 
 VOXEL = 0.01
 # Half a face diagonal of a voxel (bounds between nodes), the cell to which the level set's
@@ -264,13 +263,13 @@ def test_along_a_path_every_margin_bounds_all_configurations(small_world, robots
 
 def test_sources_apart_are_the_field_together(small_world, demo_world):
     for world in (small_world, demo_world):
-        fields = [source_field(world, name).distance for name in world.sources]
+        fields = [world.source_field(name).distance for name in world.sources]
         together = np.min(fields, axis=0)
         outside = world.field.distance > 0.0
         np.testing.assert_array_equal(together[outside], world.field.distance[outside])
         assert (together >= world.field.distance).all()
     with pytest.raises(WorldError, match="no source 'object:77'"):
-        source_field(demo_world, "object:77")
+        demo_world.source_field("object:77")
 
 
 def test_reports_are_json_and_a_table(small_world, robots):

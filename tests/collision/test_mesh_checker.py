@@ -17,7 +17,7 @@ from vprism_plan.collision.mesh import fcl
 from vprism_plan.errors import ConfigError, MissingDependencyError, RobotError
 from vprism_plan.perception import Plane
 from vprism_plan.robots import PrimitiveGeometry
-from vprism_plan.world.known import Box, Cylinder, HalfSpace, KnownMesh, Sphere
+from vprism_plan.world.config import Box, Cylinder, HalfSpace, KnownMesh, Sphere
 
 REACH = 0.1  # metres: gaps beyond it are not measured
 DENSE = 0.003  # metres: no point of a sampled surface is farther from a sample

@@ -18,9 +18,8 @@ from scipy.stats import binomtest
 import vprism_plan as vp
 from vprism_plan._kernels import checking as kernels
 from vprism_plan.collision import CheckerConfig, CollisionChecker
-from vprism_plan.collision.draws import count_path, grown
 from vprism_plan.collision.packing import pack_robot
-from vprism_plan.collision.risk import clopper_pearson, tolerated_hits
+from vprism_plan.collision.risk import clopper_pearson, count_path, grown, tolerated_hits
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.world import Box
 

@@ -8,7 +8,7 @@ from oracles.checker_oracle import sphere_positions
 from scipy.spatial import cKDTree
 
 import vprism_plan as vp
-from vprism_plan.world.known import Box, Cylinder, HalfSpace
+from vprism_plan.world.config import Box, Cylinder, HalfSpace
 from vprism_plan.world.seen import lost_cones
 
 VOXEL = 0.01

@@ -7,7 +7,7 @@ import torch
 from oracles.small_scenes import at, small_map
 
 import vprism_plan as vp
-from vprism_plan.world.known import Box
+from vprism_plan.world.config import Box
 
 CRATE = Box("crate", size=(0.12, 0.1, 0.12), T_world=at(0.0, -0.3, 0.06))  # stands on the table
 

@@ -43,7 +43,7 @@ def covered(cells, points, spacing):
     """Whether the cells of a level set's cover hold each point."""
     index = np.floor(points / spacing).astype(np.int64)
     inside = np.zeros(len(points), dtype=bool)
-    for part in (*cells.inner, cells.border):
+    for part in cells.cells:
         corners = {tuple(corner) for corner in part.index}
         owners = index // part.size * part.size
         inside |= np.array([tuple(owner) in corners for owner in owners])

@@ -11,7 +11,7 @@ from oracles.world_oracles import KernelMap
 import vprism_plan as vp
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.world import World, WorldConfig
-from vprism_plan.world.support import RIM, seen_support
+from vprism_plan.world.seen import RIM, seen_support
 
 K = intrinsics()
 TABLE = Plane((0.0, 0.0, 1.0), 0.0)

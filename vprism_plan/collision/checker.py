@@ -7,48 +7,53 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from vprism_plan._arguments import number
 from vprism_plan._kernels import checking as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.collision import entropy, explain, margins, motion
 from vprism_plan.collision.config import CheckerConfig, contact_rules
-from vprism_plan.collision.draws import Setting
-from vprism_plan.collision.inputs import Numbers, configuration, configurations, waypoints
-from vprism_plan.collision.packing import PackedWorld, pack_robot, pack_world
-from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate, StateReport
-from vprism_plan.collision.risk import PathRisk
+from vprism_plan.collision.packing import (
+    Configuration,
+    Numbers,
+    PackedWorld,
+    configuration,
+    configurations,
+    pack_robot,
+    pack_world,
+    waypoints,
+)
+from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate
+from vprism_plan.collision.risk import PathRisk, Setting, make_setting
 from vprism_plan.errors import ConfigError
+from vprism_plan.world.grid import Chosen, Values
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 
 
-class CollisionChecker:
+class CollisionChecker(explain.Checker):
     """Answers whether configurations and edges of a robot are free of a world.
 
-    A configuration is valid when its joints are within their limits, every collision
-    sphere of every moving link keeps more than `config.margin` from the world, and
-    every link pair that may collide keeps more than `config.self_margin`. All
-    distances are lower bounds, so an error can only refuse. Links that no joint moves
-    are not checked against the world: they stand on it.
+    A configuration is valid when its joints are within their limits, every collision sphere of
+    every moving link keeps more than `config.margin` from the world, and every link pair that may
+    collide keeps more than `config.self_margin`. All distances are lower bounds, so an error can
+    only refuse. Links that no joint moves are not checked against the world: they stand on it. See
+    `CheckerConfig` for `allowed_contacts` and `max_risk`.
 
-    `config.allowed_contacts` lets links touch chosen objects; `config.max_risk` bounds the
-    probability of collision (see `CheckerConfig`): in place of the level set, or beside it
-    where the bound is below the world's `level`.
-
-    Construction compiles the kernels if they are not cached on disk (some twenty seconds,
-    once per machine). Safe to share between threads; the kernels release the GIL.
-    Single queries cost a microsecond or two of compiled code: O(frames + links), plus
-    O(spheres) for the links whose bounding spheres come near something.
+    Construction compiles the kernels if they are not cached on disk (some twenty seconds, once per
+    machine). Safe to share between threads; the kernels release the GIL. Single queries cost a
+    microsecond or two of compiled code: O(frames + links), plus O(spheres) for the links whose
+    bounding spheres come near something.
 
     Args:
-        world: What to avoid: a `vprism_plan.World`, or anything that has its `field` (origin,
-            spacing, distance and source at nodes), `planes`, `plane_names`, `sources`, `config`
-            (the policies `occluded` and `unobserved`), `map.occupancy(points)` and
-            `status(points)`. Contact rules and probabilities need a `World`.
-        robot: Whose configurations are asked about: a `vprism_plan.Robot`.
-        config: Margins and tolerances.
+        world: a `vprism_plan.World`, or anything that has its `field` (origin, spacing, distance
+            and source at nodes), `planes`, `plane_names`, `sources`, `config` (the policies
+            `occluded` and `unobserved`), `map.occupancy(points)` and `status(points)`. Contact
+            rules and probabilities need a `World`.
+        robot: a `vprism_plan.Robot`.
+        config: margins and tolerances.
     """
 
     def __init__(self, world: Any, robot: Any, config: CheckerConfig | None = None) -> None:
@@ -85,10 +90,10 @@ class CollisionChecker:
     def _within_what_was_seen(self, bound: float) -> tuple[list[Any], PackedWorld]:
         """Return what verdicts under a bound on risk go by beside the draws.
 
-        Touching a point that is occupied with at least the probability `level` breaks a bound
-        below the level by itself. The draws are counted voxel by voxel, each as the ball
-        inscribed in it: alone they let a planner shave millimetres off a surface that everybody
-        sees. Under a bound above the level the seen surfaces alone are obstacles.
+        Touching a point that is occupied with at least the probability `level` breaks a bound below
+        the level by itself; the draws, counted as the balls inside voxels, would alone let a
+        planner shave millimetres off a surface that everybody sees. Under a bound above the level
+        the seen surfaces alone are obstacles.
         """
         world = self._ruled_world()
         within = bound < world.config.level
@@ -107,30 +112,13 @@ class CollisionChecker:
         self.sphere_clearances(q)
         self.pair_gaps(q)
 
-    def is_valid(self, q: Numbers) -> bool:
-        """Return whether a configuration is free.
-
-        Args:
-            q: (dof,) joint values, radians or metres, in the order of `robot.joint_names`.
-
-        Returns:
-            False also for a configuration that is not finite; ask `explain` why.
-
-        Raises:
-            RobotError: q does not have shape (dof,).
-        """
-        return self.is_valid_buffer(configuration(self.robot, q))
-
-    def is_valid_buffer(self, q: Float[np.ndarray, "dof"]) -> bool:
-        """`is_valid` without looking at the shape: q must be a contiguous float64 (dof,) array.
-
-        The path for planners' inner loops.
-        """
+    def is_valid_buffer(self, q: Configuration) -> bool:
+        """`is_valid` for planners' inner loops: q must be a contiguous float64 (dof,) array."""
         free = kernels.is_valid(q, self._rf, self._ri, *self._world)
         return free and (self._bounded is None or self._bounded.accepts_one(q))
 
-    def is_valid_batch(self, Q: Numbers) -> Bool[np.ndarray, "n"]:
-        """Return `is_valid` for each row of Q (n, dof); runs on all worker threads."""
+    def is_valid_batch(self, Q: Numbers) -> Chosen:
+        """Return `is_valid` for each row of Q; runs on all worker threads."""
         Q = configurations(self.robot, Q)
         out = np.empty(len(Q), dtype=np.bool_)
 
@@ -146,46 +134,30 @@ class CollisionChecker:
     def clearance(self, q: Numbers) -> float:
         """Return a lower bound of the distance from the robot to the world, metres.
 
-        Negative when a sphere reaches into the level set, the table, known geometry or
-        whatever else the world's policies make an obstacle. The margin is not
-        subtracted, and self-collision and joint limits do not enter. It is measured to the
-        level set also when `max_risk` decides what is valid; a link's allowed contacts do
-        not count.
-
-        Raises:
-            RobotError: q does not have shape (dof,) or is not finite.
+        Negative when a sphere reaches into what the world makes an obstacle. The margin is not
+        subtracted, and self-collision and joint limits do not enter. It is measured to the level
+        set also when `max_risk` decides what is valid; a link's allowed contacts do not count.
+        RobotError if q is not finite.
         """
         return float(self._clearances(configuration(self.robot, q)[None])[0][0])
 
-    def clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
-        """Return `clearance` for each row of Q (n, dof), metres."""
+    def clearance_batch(self, Q: Numbers) -> Values:
+        """Return `clearance` for each row of Q, metres."""
         return self._clearances(Q)[0]
 
-    def self_clearance_batch(self, Q: Numbers) -> Float[np.ndarray, "n"]:
+    def self_clearance_batch(self, Q: Numbers) -> Values:
         """Return the smallest gap between links that may collide, for each row of Q, metres."""
         return self._clearances(Q)[1]
 
-    def check_motion(self, qa: Numbers, qb: Numbers) -> bool:
-        """Return whether the straight edge from qa to qb is free, ends included.
+    def check_motion_buffer(self, qa: Configuration, qb: Configuration) -> bool:
+        """`check_motion` for contiguous float64 (dof,) arrays, without looking at shapes.
 
-        The edge is straight in joint space and means what its ends say: a continuous joint
-        turns by their difference, however often round. It is covered by conservative
-        advancement on the clearances, with every link's displacement bounded from the
-        kinematic chain. Where clearance is so small that the steps fall below
-        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance`
-        metres of motion. With `max_risk`, the worlds that collide anywhere on the edge must
-        be few enough, too.
-
-        Raises:
-            RobotError: An end does not have shape (dof,).
+        Covered by conservative advancement on the clearances, with every link's displacement
+        bounded from the kinematic chain. Where clearance is so small that the steps fall below
+        `config.min_motion`, it samples: an accepted edge is free up to `config.tolerance` metres of
+        motion. With `max_risk`, the worlds that collide anywhere on the edge must be few enough,
+        too.
         """
-        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
-        return self.check_motion_buffer(qa, qb)
-
-    def check_motion_buffer(
-        self, qa: Float[np.ndarray, "dof"], qb: Float[np.ndarray, "dof"]
-    ) -> bool:
-        """`check_motion` for contiguous float64 (dof,) arrays, without looking at shapes."""
         return self._check_motion(qa, qb, np.empty(4))
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
@@ -215,13 +187,10 @@ class CollisionChecker:
     def tightened(self, level: int) -> "CollisionChecker | None":
         """Return a checker with a stricter bound on risk; None if there is no stricter one.
 
-        Each edge of a path may be within `max_risk` and the path still above it. Level by
-        level fewer worlds may collide with an edge, then none, then the spheres grow by up
-        to two voxels. Everything is shared with this checker, whose verdicts include those
-        of the stricter one.
-
-        Raises:
-            ConfigError: this checker has no `max_risk`.
+        Each edge of a path may be within `max_risk` and the path still above it. Level by level
+        fewer worlds may collide with an edge, then none, then the spheres grow by up to two voxels.
+        Everything is shared with this checker, whose verdicts include those of the stricter one.
+        ConfigError without a `max_risk`.
         """
         if self._bounded is None:
             raise ConfigError("max_risk is None; only a bound on risk can be tightened")
@@ -234,9 +203,8 @@ class CollisionChecker:
         return stricter
 
     def with_extra_margin(self, extra: float) -> "CollisionChecker":
-        """Return the same checker with `extra` metres (at least 0) more margin."""
-        if not extra >= 0.0:
-            raise ConfigError(f"extra is {extra!r} m; a margin can only be widened")
+        """Return the same checker with `extra` metres more margin."""
+        number("extra", extra, 0.0, unit="metres: a margin can only be widened")
         config = replace(self.config, margin=self.config.margin + extra)
         wider = CollisionChecker(self.world, self.robot, config)
         for level in self._levels:
@@ -245,18 +213,22 @@ class CollisionChecker:
             wider = tightened
         return wider
 
-    def explain(self, q: Numbers) -> StateReport:
-        """Return the verdict on a configuration with every reason that refuses it.
+    def contacts(self, q: Numbers) -> tuple[Contact, ...]:
+        """Return every reason to refuse q: the deepest contact of each link and body first,
+        what `max_risk` refuses last."""
+        q = configuration(self.robot, q)
+        limits, bounded = explain.limit_contacts(self.robot, q), self._bounded
+        if not np.isfinite(q).all():
+            return tuple(limits)
+        found = [*explain.world_contacts(self, q), *explain.self_contacts(self, q), *limits]
+        risky = bounded is not None and not bounded.accepts_one(q)
+        return (*explain.by_depth(found), *(bounded.contacts(q) if bounded and risky else ()))
 
-        Raises:
-            RobotError: q does not have shape (dof,).
-        """
-        return explain.explain(self, configuration(self.robot, q))
+    def _permitted(self, q: Configuration) -> list[Contact]:
+        return explain.allowed_contacts(self, q)
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is usable but odd about the world and the robot; every verdict carries it."""
-        return explain.warnings_of(self.world, self.robot)
+    def _centers(self, q: Configuration) -> Float[np.ndarray, "s 3"]:
+        return self.sphere_clearances(q)[0]
 
     def verdict_field(self, link: int) -> Any:
         """Return the distance field that verdicts check a link (index) against."""
@@ -267,21 +239,17 @@ class CollisionChecker:
         return self._rules[int(self._link_rules[link])]
 
     def sphere_clearances(
-        self, q: Float[np.ndarray, "dof"]
+        self, q: Configuration
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return each sphere's centre (S, 3) in the world, and what is near it.
-
-        Returns:
-            Centres; distance to the nearest half-space and its index in
-            `world.planes`; lower bound of the distance to the baked obstacles. Metres.
-        """
+        """Return each sphere's centre (S, 3) in the world; the distance to the nearest half-space
+        and its index in `world.planes`; a lower bound of that to the baked obstacles. Metres."""
         n = int(self._ri[1])
         centers, plane, field = np.empty((3, n)), np.empty(n), np.empty(n)
         which = np.empty(n, dtype=np.int64)
         kernels.sphere_clearances(q, self._rf, self._ri, *self._world, centers, plane, which, field)
         return np.ascontiguousarray(centers.T), plane, which, field
 
-    def pair_gaps(self, q: Float[np.ndarray, "dof"]) -> tuple[np.ndarray, np.ndarray]:
+    def pair_gaps(self, q: Configuration) -> tuple[np.ndarray, np.ndarray]:
         """Return the gap of each of `robot.collision_pairs`, metres, and the spheres (P, 2)."""
         n = int(self._ri[3])
         gaps, spheres = np.empty(n), np.zeros((n, 2), dtype=np.int64)
@@ -306,36 +274,28 @@ class CollisionChecker:
         run_chunked(work, len(Q), _BATCH_CHUNK)
         return world, own
 
-    # --- margins ---------------------------------------------------------------------------
-
     safety_margin = margins.safety_margin
     min_clearance = motion.min_clearance
     max_safe_motion = motion.max_safe_motion
     path_entropy = entropy.path_entropy
 
-    # --- risk --------------------------------------------------------------------------
     @property
     def max_risk(self) -> float | None:
         """Bound on the probability of collision of what is valid, or None."""
         return self.config.max_risk
 
     def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
-        """Return the probability that a path (or a configuration) touches anything.
+        """Return the probability that a path (T, dof), or a configuration (dof,), touches anything.
 
-        The share of worlds, drawn from the map's posterior, in which any sphere of any
-        moving link touches an occupied voxel that it may not touch, or a certain obstacle,
-        anywhere on the path: the same world for the whole path. Edges are straight in joint
-        space and swept without gaps. Margin, self-collision and joint limits do not enter.
+        The share of worlds, drawn from the map's posterior, in which any sphere of any moving link
+        touches an occupied voxel that it may not touch, or a certain obstacle, anywhere on the
+        path: the same world for the whole path. Edges are straight in joint space and swept without
+        gaps. Margin, self-collision and joint limits do not enter. RobotError as for
+        `packing.waypoints`.
 
-        Args:
-            path: (T, dof) waypoints, or (dof,) one configuration, radians or metres.
-            held_out: ask other worlds than those that `max_risk` is checked with. A path
-                that a planner found with this checker was selected by the worlds it was
-                checked with, so their verdict on it is too mild.
-
-        Raises:
-            RobotError: a wrong shape, a value that is not finite, or a prismatic joint
-                outside its limits (no bound on the motion holds there).
+        With `held_out` other worlds are asked than those that `max_risk` is checked with: a path
+        that a planner found with this checker was selected by those, so their verdict on it is too
+        mild.
         """
         rows = waypoints(self.robot, path, single=True)
         risk = self._risk()
@@ -353,17 +313,12 @@ class CollisionChecker:
         with self._lock:
             if self._path_risk is None:
                 self._path_risk = PathRisk(
-                    self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
+                    make_setting(
+                        self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
+                    )
                 )
             return self._path_risk
 
     def risk_setting(self) -> Setting:
         """Return what probabilities are counted with, for planners' objectives."""
         return self._risk().setting
-
-    def risk_contacts(self, q: Float[np.ndarray, "dof"]) -> tuple[Contact, ...]:
-        """Return what makes a configuration too risky; empty if it is not, or has no bound."""
-        bounded = self._bounded
-        if bounded is None or bounded.accepts_one(q):
-            return ()
-        return bounded.contacts(q)

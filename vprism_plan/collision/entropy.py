@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.collision.inputs import Numbers
+from vprism_plan._arguments import number
 from vprism_plan.collision.motion import edges_of, place_points
+from vprism_plan.collision.packing import Numbers, Rows, Waypoints
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses
+from vprism_plan.world.grid import Chosen, Index, Points
 
 _POINTS = 64  # per sphere and waypoint
 _MAX_CELLS = 200_000_000
@@ -19,24 +21,23 @@ _CHUNK = 1 << 20  # voxel candidates in memory at once
 
 @dataclass(frozen=True)
 class PathEntropy:
-    """Answer of `path_entropy`. Only links that joints move count.
+    """Answer of `path_entropy`; nats. Only links that joints move count.
 
     The map's entropy means something where it has support (kernel mass at least
-    `WorldConfig.min_support`); elsewhere it repeats the prior. Means, maxima and
-    totals are over supported volume only; the rest is reported as a share.
+    `WorldConfig.min_support`); elsewhere it repeats the prior. Means, maxima and totals are over
+    supported volume only; the rest is reported as a share.
 
     Attributes:
-        waypoint_mean: (T,) entropy averaged over the spheres' supported volume, nats;
-            nan where no part of the robot is in supported space.
-        waypoint_max: (T,) largest average of any one sphere, nats; nan likewise.
+        waypoint_mean: (T,) average over the spheres' supported volume; nan where there is none.
+        waypoint_max: (T,) largest average of any one sphere; nan likewise.
         waypoint_unsupported: (T,) share of the spheres' volume without support.
-        swept_total: integral of the entropy over the supported part of the volume that
-            the spheres sweep along the path, m^3 nats; every voxel counts once.
-        swept_mean: its average there, nats; nan if nothing is supported.
+        swept_total: integral over the supported part of the volume that the spheres sweep along the
+            path, m^3 nats; every voxel counts once.
+        swept_mean: its average there; nan if nothing is supported.
         swept_volume: all of the swept volume, m^3.
         unsupported_share: share of the swept volume without support.
-        resolution: edge of the voxels, metres. A voxel is swept if its centre is in some
-            sphere at some sampled configuration.
+        resolution: edge of the voxels, metres. One is swept if its centre is in some sphere at some
+            sampled configuration.
         spacing: largest motion between two samples, metres.
         configurations: samples on the path.
         voxels: voxels swept.
@@ -79,11 +80,10 @@ class PathEntropy:
 def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> PathEntropy:
     """Return the map's entropy along a path and over the volume it sweeps.
 
-    Per waypoint 64 points in every sphere are asked; in the swept volume every voxel
-    whose centre some sphere covers, once. Edges are sampled so that nothing moves more
-    than half a voxel between samples: between two balls of radius r that leaves out a
-    rim at most resolution^2 / (32 r) deep. O(configurations x spheres x voxels per
-    sphere) additions and one evaluation of the map per voxel near its support.
+    Per waypoint 64 points in every sphere are asked; in the swept volume every voxel whose centre
+    some sphere covers, once. Nothing moves more than half a voxel between samples: between two
+    balls of radius r that leaves out a rim at most resolution^2 / (32 r) deep. O(configurations x
+    spheres x voxels per sphere) additions and one evaluation of the map per voxel near its support.
 
     Args:
         checker: a `CollisionChecker` over a `World`.
@@ -91,11 +91,9 @@ def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> 
         resolution: edge of a voxel, metres.
 
     Raises:
-        RobotError: the shape is wrong, a value is not finite, a sliding joint leaves its
-            limits, or the resolution is too fine for the path.
+        RobotError: see `waypoints`; or the resolution is too fine for the path.
     """
-    if not (np.isfinite(resolution) and resolution > 0.0):
-        raise RobotError(f"resolution is {resolution!r}; it must be positive and finite (metres)")
+    number("resolution", resolution, 0.0, unit="metres", above=True, error=RobotError)
     edges = edges_of(checker, q_or_path, single=True)
     Q, _ = edges.samples(0.25 * resolution)
     mean, most, unsupported, asked = _at_waypoints(checker, edges.path)
@@ -118,22 +116,16 @@ def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> 
     )
 
 
-def _moving(checker: Any) -> Int[np.ndarray, " s"]:
+def _moving(checker: Any, Q: Rows) -> tuple[Float[np.ndarray, "n s 3"], Float[np.ndarray, " s"]]:
+    """Centres (world) and radii of the spheres of the links that joints move, metres."""
     arrays = checker.robot.arrays
-    return np.flatnonzero(~np.asarray(arrays.link_fixed)[arrays.sphere_link])
-
-
-def _centers(
-    checker: Any, Q: Float[np.ndarray, "n dof"], spheres: Int[np.ndarray, " s"]
-) -> Float[np.ndarray, "n s 3"]:
-    arrays = checker.robot.arrays
+    spheres = np.flatnonzero(~np.asarray(arrays.link_fixed)[arrays.sphere_link])
     R, t = frame_poses(arrays, Q)
-    return place_points(R, t, arrays.sphere_frame[spheres], arrays.sphere_center[spheres])
+    centers = place_points(R, t, arrays.sphere_frame[spheres], arrays.sphere_center[spheres])
+    return centers, arrays.sphere_radius[spheres]
 
 
-def _entropy(
-    checker: Any, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " k"], Bool[np.ndarray, " n"], int]:
+def _entropy(checker: Any, points: Points) -> tuple[Float[np.ndarray, " k"], Chosen, int]:
     """Entropy, nats, of the points with support; which those are; how many the map was asked."""
     map_, least = checker.world.map, checker.world.config.min_support
     lower, upper = map_.support_bounds()
@@ -146,7 +138,7 @@ def _entropy(
     return entropy, supported, int(near.sum() + supported.sum())
 
 
-def _even_points(n: int) -> Float[np.ndarray, "n 3"]:
+def _even_points(n: int) -> Points:
     """Points spread evenly over the volume of the unit ball: a spiral, its radii shuffled."""
     i = np.arange(n) + 0.5
     height = 1.0 - 2.0 * i / n
@@ -158,16 +150,14 @@ def _even_points(n: int) -> Float[np.ndarray, "n 3"]:
 
 
 def _at_waypoints(
-    checker: Any, path: Float[np.ndarray, "t dof"]
+    checker: Any, path: Waypoints
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int]:
     """Mean, largest sphere average and unsupported share per waypoint; points asked."""
-    spheres = _moving(checker)
-    radii = checker.robot.arrays.sphere_radius[spheres]
     ball = _even_points(_POINTS)
     mean, most, unsupported, asked = [], [], [], 0
     for q in path:
-        centers = _centers(checker, q[None], spheres)[0]
-        points = (centers[:, None] + radii[:, None, None] * ball).reshape(-1, 3)
+        centers, radii = _moving(checker, q[None])
+        points = (centers[0][:, None] + radii[:, None, None] * ball).reshape(-1, 3)
         entropy, supported, count = _entropy(checker, points)
         asked += count
         values = np.zeros(len(points))
@@ -183,21 +173,12 @@ def _at_waypoints(
     return tuple(mean), tuple(most), tuple(unsupported), asked
 
 
-def swept_voxels(
-    checker: Any, Q: Float[np.ndarray, "n dof"], resolution: float
-) -> Int[np.ndarray, "v 3"]:
-    """Voxels, each once, whose centre lies in a sphere of a moving link at some row of Q.
-
-    Voxel (i, j, k) has its centre at resolution * (i, j, k), world, metres.
-
-    Raises:
-        RobotError: the resolution is too fine for what the robot sweeps.
-    """
-    spheres = _moving(checker)
-    if len(spheres) == 0:
+def swept_voxels(checker: Any, Q: Rows, resolution: float) -> Int[np.ndarray, "v 3"]:
+    """Voxels (centres at resolution * (i, j, k), world, metres), each once, whose centre lies in
+    a sphere of a moving link at some row of Q; RobotError if they would be too many."""
+    centers, radii = _moving(checker, Q)
+    if len(radii) == 0:
         return np.empty((0, 3), dtype=np.int64)
-    centers = _centers(checker, Q, spheres)
-    radii = checker.robot.arrays.sphere_radius[spheres]
     grown = radii[:, None] + 2.0 * resolution
     low = np.floor((centers - grown).min(axis=(0, 1)) / resolution).astype(np.int64)
     high = np.ceil((centers + grown).max(axis=(0, 1)) / resolution).astype(np.int64)
@@ -213,7 +194,7 @@ def swept_voxels(
     return np.argwhere(swept) + low
 
 
-def _thinned(centers: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndarray, "m 3"]:
+def _thinned(centers: Points, spacing: float) -> Float[np.ndarray, "m 3"]:
     """Leave out centres as long as the way between those kept is at most the spacing."""
     way = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(way)])
@@ -226,7 +207,7 @@ def _thinned(centers: Float[np.ndarray, "n 3"], spacing: float) -> Float[np.ndar
 
 def _stamp(
     swept: Bool[np.ndarray, "x y z"],
-    low: Int[np.ndarray, " 3"],
+    low: Index,
     centers: Float[np.ndarray, "m 3"],
     radius: float,
     resolution: float,

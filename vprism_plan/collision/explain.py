@@ -1,26 +1,28 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Turns a refused configuration into named reasons. Not on the fast path."""
+"""What every checker answers, and why it refuses: named reasons, not on the fast path."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._kernels.checking import FARTHEST
-from vprism_plan.collision.reports import Contact, Kind, StateReport, as_point, kind_of
-from vprism_plan.world.visibility import free_balls
+from vprism_plan.collision.packing import Configuration, Numbers, configuration
+from vprism_plan.collision.reports import Contact, Kind, StateReport, as_point
+from vprism_plan.world.grid import Balls, Points, Vector, window
+from vprism_plan.world.sources import policies, source_of
+from vprism_plan.world.visibility import UNSEEN, free_balls
 
 # Signed distance, metres; where, world; unit direction that leads out.
-Touch = tuple[Any, Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+Touch = tuple[Any, Vector, Vector]
 
-_STATUS_NAMES = {1: "occluded", 2: "unobserved", 3: "outside"}
-_UP = np.array([0.0, 0.0, 1.0])  # out of what says nothing of the way out
+UP = np.array([0.0, 0.0, 1.0])  # out of what says nothing of the way out
 _SAMPLES = 96
 _AROUND = 2  # nodes beyond a point's cell that are asked for the nearest obstacle's name
 
 
-def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
+def unit_ball_points(n: int = _SAMPLES) -> Points:
     """Return n points spread evenly through the unit ball, its surface included."""
     i = np.arange(n) + 0.5
     polar = np.arccos(1.0 - 2.0 * i / n)
@@ -34,62 +36,53 @@ def unit_ball_points(n: int = _SAMPLES) -> Float[np.ndarray, "n 3"]:
     return directions * radius[:, None]
 
 
-def explain(checker: Any, q: Float[np.ndarray, "dof"]) -> StateReport:
-    """Return the report of `CollisionChecker.explain`."""
+class Checker:
+    """What checkers answer alike; see there for `is_valid_buffer` and `check_motion_buffer` (the
+    same for contiguous float64 arrays, whatever their shape), `clearance` and `contacts`.
 
-    def contacts(q: np.ndarray) -> list[Contact]:
-        found = [*_world_contacts(checker, q), *_self_contacts(checker, q)]
-        found += limit_contacts(checker.robot, q)
-        return [*by_depth(found), *checker.risk_contacts(q)]
-
-    return report(
-        checker,
-        q,
-        contacts,
-        lambda q: _allowed_contacts(checker, q),
-        lambda q: checker.sphere_clearances(q)[0],
-    )
-
-
-def report(
-    checker: Any,
-    q: Float[np.ndarray, "dof"],
-    contacts: Callable[[np.ndarray], Iterable[Contact]],
-    permitted: Callable[[np.ndarray], Iterable[Contact]],
-    centers: Callable[[np.ndarray], Float[np.ndarray, "s 3"]],
-) -> StateReport:
-    """Put the report of a checker together.
-
-    Args:
-        checker: whose verdict it is.
-        q: configuration.
-        contacts: what refuses it, in the order of the report; asked only if it is refused.
-        permitted: contacts that the rules permit.
-        centers: of the robot's spheres, world, metres.
+    A configuration is (dof,) joint values, radians or metres, in the order of `robot.joint_names`,
+    a batch (n, dof); what has another shape raises RobotError.
     """
-    world, margin = checker.world, checker.config.margin
-    policies = {"occluded": world.config.occluded, "unobserved": world.config.unobserved}
-    told: dict[str, Any] = {"policies": policies, "warnings": checker.warnings}
-    if not np.isfinite(q).all():
-        limits = tuple(limit_contacts(checker.robot, q))
-        return StateReport(False, limits, np.nan, np.nan, margin, **told)
-    valid = checker.is_valid(q)
-    return StateReport(
-        valid=valid,
-        contacts=() if valid else tuple(contacts(q)),
-        clearance=checker.clearance(q),
-        self_clearance=float(checker.self_clearance_batch(q[None])[0]),
-        margin=margin,
-        shares=volume_shares(world, checker.robot, centers(q)),
-        allowed=tuple(permitted(q)),
-        **told,
-    )
 
+    def is_valid(self: Any, q: Numbers) -> bool:
+        """Return whether a configuration is free; one that is not finite is not."""
+        return self.is_valid_buffer(configuration(self.robot, q))
 
-def warnings_of(world: Any, robot: Any) -> tuple[str, ...]:
-    """What is usable but odd about a world and a robot."""
-    found = (*getattr(world, "warnings", ()), *getattr(robot, "warnings", ()))
-    return tuple(dict.fromkeys(found))
+    def check_motion(self: Any, qa: Numbers, qb: Numbers) -> bool:
+        """Return whether the edge from qa to qb, straight in joint space, is free, ends included.
+        A continuous joint turns by their difference, however often round."""
+        qa, qb = configuration(self.robot, qa), configuration(self.robot, qb)
+        return self.check_motion_buffer(qa, qb)
+
+    def explain(self: Any, q: Numbers) -> StateReport:
+        """Return the verdict on a configuration with every reason that refuses it."""
+        q = configuration(self.robot, q)
+        margin = self.config.margin
+        told: dict[str, Any] = {"policies": policies(self.world.config), "warnings": self.warnings}
+        if not np.isfinite(q).all():
+            limits = tuple(limit_contacts(self.robot, q))
+            return StateReport(False, limits, np.nan, np.nan, margin, **told)
+        valid = self.is_valid(q)
+        return StateReport(
+            valid=valid,
+            contacts=() if valid else self.contacts(q),
+            clearance=self.clearance(q),
+            self_clearance=float(self.self_clearance_batch(q[None])[0]),
+            margin=margin,
+            shares=volume_shares(self.world, self.robot, self._centers(q)),
+            allowed=tuple(self._permitted(q)),
+            **told,
+        )
+
+    def _centers(self: Any, q: Configuration) -> Float[np.ndarray, "s 3"]:
+        """Centres of the robot's spheres, world, metres."""
+        return np.asarray(self.robot.sphere_centers(q))
+
+    @property
+    def warnings(self: Any) -> tuple[str, ...]:
+        """What is usable but odd about the world and the robot; every verdict carries it."""
+        found = (*getattr(self.world, "warnings", ()), *getattr(self.robot, "warnings", ()))
+        return tuple(dict.fromkeys(found))
 
 
 def by_depth(contacts: Iterable[Contact]) -> list[Contact]:
@@ -101,19 +94,16 @@ def volume_shares(world: Any, robot: Any, centers: Float[np.ndarray, "s 3"]) -> 
     """Return which share of the moving links' sphere volume lies in space nobody has seen."""
     moving = ~np.asarray(robot.arrays.link_fixed)[robot.sphere_links]
     if not moving.any():
-        return dict.fromkeys(_STATUS_NAMES.values(), 0.0)
+        return dict.fromkeys(UNSEEN.values(), 0.0)
     centers, radii = centers[moving], robot.sphere_radii[moving]
     ball = unit_ball_points()
     points = centers[:, None] + radii[:, None, None] * ball
     status = np.asarray(world.status(points.reshape(-1, 3))).reshape(len(radii), -1)
     weight = radii**3 / np.sum(radii**3)
-    return {
-        name: float(weight @ np.mean(status == code, axis=1))
-        for code, name in _STATUS_NAMES.items()
-    }
+    return {name: float(weight @ np.mean(status == k, axis=1)) for k, name in UNSEEN.items()}
 
 
-def limit_contacts(robot: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def limit_contacts(robot: Any, q: Configuration) -> list[Contact]:
     """Return the joints that are not finite, absurdly far, or outside their limits."""
     found = []
     for j, name in enumerate(robot.joint_names):
@@ -139,7 +129,7 @@ def limit_contacts(robot: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
     return found
 
 
-def _world_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def world_contacts(checker: Any, q: Configuration) -> list[Contact]:
     """Return the deepest contact of each (link, body), from every sphere's own distances."""
     robot, world, margin = checker.robot, checker.world, checker.config.margin
     centers, plane, which, field = checker.sphere_clearances(q)
@@ -156,20 +146,19 @@ def _world_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
             row = world.planes[which[s]]
             body = world.plane_names[which[s]]
             touch = plane[s] + padding, centers[s] - radius * row[:3], row[:3]
-            found.append(contact(kind_of(body), name, body, touch, required, s))
+            found.append(contact(source_of(body).kind, name, body, touch, required, s))
         if not field[s] > margin:
             body, normal = nearest_source(world, checker.verdict_field(link), centers[s])
-            kind = kind_of(body)
-            sure = None
-            if kind not in {"known", "support"}:
+            source, sure = source_of(body), None
+            if source.judged:
                 ball = centers[s] + radius * unit_ball_points()
                 sure = float(np.max(world.map.occupancy(ball)))
             touch = field[s] + padding, centers[s] - radius * normal, normal
-            detail = policy_detail(world.config, kind)
-            if kind == "occluded":
+            detail = source.reason(world.config)
+            if source.kind == "occluded":
                 at = np.append(centers[s], radius)
                 detail += _beside_pictured_robot(at, robots, margin, world)
-            found.append(contact(kind, name, body, touch, required, s, sure, detail))
+            found.append(contact(source.kind, name, body, touch, required, s, sure, detail))
     return deepest(found)
 
 
@@ -201,19 +190,8 @@ def deepest(contacts: Iterable[Contact]) -> list[Contact]:
     return list(found.values())
 
 
-def policy_detail(config: Any, kind: Kind) -> str:
-    """Return why what no object of the map accounts for is an obstacle."""
-    if kind == "unobserved" and config.unobserved == "free":
-        return "farther away than was judged; WorldConfig(bounds=...) can take it in"
-    return {
-        "occluded": f"no camera saw this space; policy occluded={config.occluded!r}",
-        "unobserved": f"no camera looked here; policy unobserved={config.unobserved!r}",
-        "background": "observed points without an object label",
-    }.get(kind, "")
-
-
 def _beside_pictured_robot(
-    sphere: Float[np.ndarray, "4"], robots: Float[np.ndarray, "s 4"], margin: float, world: Any
+    sphere: Float[np.ndarray, "4"], robots: Balls, margin: float, world: Any
 ) -> str:
     """The remedy for a sphere in the shadow of the robot as it was in a picture, or nothing."""
     away = np.linalg.norm(robots[:, :3] - sphere[:3], axis=1)
@@ -223,7 +201,7 @@ def _beside_pictured_robot(
     return f"; beside the pictured robot: ignore_self(..., room={room:g}) is your word for it"
 
 
-def _allowed_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def allowed_contacts(checker: Any, q: Configuration) -> list[Contact]:
     """Return the deepest contact of each link with each object that it may touch."""
     robot, world = checker.robot, checker.world
     if not any(checker.allowed_objects(link) for link in range(len(robot.link_names))):
@@ -246,14 +224,12 @@ def _allowed_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact
     return deepest(found)
 
 
-def nearest_source(
-    world: Any, field: Any, point: Float[np.ndarray, "3"]
-) -> tuple[str, Float[np.ndarray, "3"]]:
+def nearest_source(world: Any, field: Any, point: Vector) -> tuple[str, Vector]:
     """Return the name of the obstacle nearest to a point and the direction away from it.
 
-    A node at the distance d from an obstacle says that it is at most d plus the way to the
-    node from the point. The smallest such sum over the nodes around names the nearest one
-    to within a fraction of a voxel: some node lies close to the way there.
+    A node at the distance d from an obstacle says that it is at most d plus the way to the node
+    from the point. The smallest such sum over the nodes around names the nearest one to within a
+    fraction of a voxel: some node lies close to the way there.
     """
     shape = np.array(field.distance.shape)
     g = (point - field.origin) / field.spacing
@@ -270,22 +246,22 @@ def nearest_source(
     corners = cell + np.indices((2, 2, 2)).reshape(3, -1).T
     values = np.asarray(field.distance[tuple(corners.T)], dtype=np.float64)
     low, high = np.maximum(cell - _AROUND, 0), np.minimum(cell + _AROUND + 2, shape)
-    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
     nodes = low + np.moveaxis(np.indices(tuple(high - low)), 0, -1)
     ways = np.asarray(field.spacing * np.linalg.norm(nodes - inside, axis=-1))
-    ways += np.maximum(field.distance[window], 0.0)
+    ways += np.maximum(field.distance[window(low, high)], 0.0)
     nearest = low + np.array(np.unravel_index(int(np.argmin(ways)), ways.shape))
     slope = values.reshape(2, 2, 2)
     gradient = np.array([np.mean(np.diff(slope, axis=axis)) for axis in range(3)], dtype=np.float64)
     if outside:
         gradient = inside - g
     length = float(np.linalg.norm(gradient))
-    normal = gradient / length if np.isfinite(length) and length > 0 else _UP
+    normal = gradient / length if np.isfinite(length) and length > 0 else UP
     name = "unobserved" if outside else world.sources[int(field.source[tuple(nearest)])]
     return name, normal
 
 
-def _self_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
+def self_contacts(checker: Any, q: Configuration) -> list[Contact]:
+    """Return the link pairs that come too near to each other."""
     robot, margin = checker.robot, checker.config.self_margin
     gaps, spheres = checker.pair_gaps(q)
     centers = checker.sphere_clearances(q)[0]
@@ -295,7 +271,7 @@ def _self_contacts(checker: Any, q: Float[np.ndarray, "dof"]) -> list[Contact]:
         s, t = (int(sphere) for sphere in spheres[p])
         apart = centers[s] - centers[t]
         length = float(np.linalg.norm(apart))
-        normal = apart / length if length > 0 else _UP
+        normal = apart / length if length > 0 else UP
         point = centers[s] - robot.sphere_radii[s] * normal
         names, touch = robot.link_names, (float(gaps[p]), point, normal)
         found.append(contact("self", names[a], names[b], touch, margin, s))

@@ -8,41 +8,38 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from vprism_plan.collision.inputs import Numbers, checked_tolerance, configurations
 from vprism_plan.collision.motion import edges_of, joint_units, place_points, sphere_jacobians
-from vprism_plan.collision.reports import SPOKEN, Kind, kind_of
+from vprism_plan.collision.packing import Numbers, Rows, checked_tolerance, configurations
+from vprism_plan.collision.reports import Kind
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses, joint_values
 from vprism_plan.world.distance import DistanceField
-from vprism_plan.world.source_fields import source_field
+from vprism_plan.world.grid import Points, Values
+from vprism_plan.world.sources import object_id, source_of, spoken
 
 _CHUNK = 512  # configurations whose spheres are in memory at once
 
 
 @dataclass(frozen=True)
 class BodyMargin:
-    """Where one link and one obstacle are nearest to each other.
+    """Where one link and one obstacle are nearest to each other; metres, world frame.
 
     Attributes:
         link: the link.
-        body: the obstacle, named as in `Contact.body`.
-        kind: what it is.
-        clearance: lower bound of the distance between them, metres; negative inside.
-            Along a path: over all of it, edges included.
-        gradient: (dof,) change of the distance per radian or metre of each joint, at the
-            configuration where they are nearest, from the slope of the distance field;
-            zeros where that has none (in the middle of an obstacle).
-        nearest: point of the obstacle nearest to the sphere's centre, world, metres, to
-            within a voxel of the world's field (exact for half-spaces; rough from beyond
-            the grid). From a centre inside the obstacle: the nearest way out.
-        witness: point of the link's surface nearest to it, world, metres.
+        body: the obstacle, and ...
+        kind: ... what it is, as in `Contact`.
+        clearance: lower bound of the distance between them (over all of a path); negative inside.
+        gradient: (dof,) its change per radian or metre of each joint, from the slope of the
+            distance field; zeros where that has none (in the middle of an obstacle).
+        nearest: point of the obstacle nearest to the sphere's centre, to within a voxel (exact for
+            half-spaces; rough from beyond the grid). From inside the obstacle: the nearest way out.
+        witness: point of the link's surface nearest to it.
         sphere: the link's collision sphere on which `witness` lies.
-        occupancy: the map's P(occupied) at `nearest`; None where the map has no say
-            (support surface, known geometry).
+        occupancy: the map's P(occupied) at `nearest`; None where the map has no say (support
+            surface, known geometry).
         entropy: the map's entropy there, nats; None likewise.
         allowed: whether a contact rule lets this link touch this object.
-        place: where on the path: number of the edge plus the fraction of it; 0 for a
-            single configuration.
+        place: where on the path: number of the edge plus the fraction of it.
     """
 
     link: str
@@ -76,8 +73,8 @@ class SafetyMargins:
         joint_names: names of the gradients' entries.
         joint_units: their units, "rad" or "m".
         resolution: voxel of the world's field, metres: how exact `nearest` is.
-        tolerance: what was subtracted, metres, so that the bounds hold between the
-            configurations that were looked at; 0 for a single one.
+        tolerance: what was subtracted, metres, so that the bounds hold between the configurations
+            that were looked at; 0 for a single one.
         configurations: how many that were.
     """
 
@@ -130,8 +127,7 @@ class SafetyMargins:
         steepest = int(np.argmax(np.abs(margin.gradient)))
         slope = 1000 * margin.gradient[steepest]
         joint = f"{self.joint_names[steepest]} {slope:+.0f} mm/{self.joint_units[steepest]}"
-        unseen = margin.kind in {"occluded", "unobserved"}
-        body = SPOKEN[margin.body] if unseen else margin.body
+        body = spoken(margin.body) if source_of(margin.body).policy else margin.body
         return (
             margin.link,
             body + (" (allowed)" if margin.allowed else ""),
@@ -148,37 +144,25 @@ class SafetyMargins:
 
 @dataclass(frozen=True, eq=False)
 class Obstacle:
-    """One obstacle.
-
-    Attributes:
-        name: "object:3", "support surface", "background", "occluded", "unobserved" or
-            "known:NAME".
-        kind: what it is.
-        plane: (4,) normal and offset of a half-space, else None.
-        field: distances to everything else, else None.
-    """
+    """One of `World.sources` or `World.plane_names`: a half-space with its normal and offset
+    (4,), or what has a field of distances."""
 
     name: str
     kind: Kind
     plane: Any = None
     field: DistanceField | None = None
 
-    def bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def bound(self, points: Points) -> Values:
         """Lower bound of the signed distance from points (world, metres); exact for planes."""
         if self.field is None:
             return np.asarray(points @ self.plane[:3] - self.plane[3])
         return self.field.lower_bound(points)
 
-    def nearest(
-        self, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Nearest points of the obstacle (of what is not the obstacle, from inside it), and
-        the unit directions in which the distance grows (0 where it has no slope).
-
-        One step down the slope of the nodes' distances, to within a voxel; from beyond the
-        grid, the nearest as seen from the grid's face. Directions are within a degree for
-        most points, a few degrees off within a voxel of an edge.
-        """
+    def nearest(self, points: Points) -> tuple[Points, Points]:
+        """Nearest points of the obstacle (from inside it, of what is not), and the unit directions
+        in which the distance grows (0 where it has no slope): one step down the slope of the nodes'
+        distances, to within a voxel; from beyond the grid, as seen from its face. Directions are
+        within a degree for most points, a few degrees off within a voxel of an edge."""
         if self.field is None:
             normal = np.tile(self.plane[:3], (len(points), 1))
             return points - self.bound(points)[:, None] * normal, normal
@@ -194,14 +178,9 @@ class Obstacle:
         return found, normal
 
 
-def _slope(
-    field: DistanceField, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Interpolated distance and its unit slope, from differences over one voxel.
-
-    Over a voxel, because the slope of a trilinear interpolation itself is constant along
-    each axis of a cell: off a ball it errs by three degrees, these by less than one.
-    """
+def _slope(field: DistanceField, points: Points) -> tuple[Values, Points]:
+    """Interpolated distance and its unit slope, from differences over one voxel: the slope of a
+    trilinear interpolation errs by three degrees off a ball, these by less than one."""
     import torch
 
     half = 0.5 * field.spacing
@@ -218,43 +197,36 @@ def _slope(
 
 
 def obstacles_of(world: Any, without: frozenset[int] = frozenset()) -> tuple[Obstacle, ...]:
-    """All obstacles of a `World`: half-spaces, then `world.sources` in order.
-
-    Objects `without` may be touched: occluded space inside them goes. Fields are baked on first
-    use: about half a second each for a table top at 1 cm, 6 bytes per node while the world lives.
-    """
-    found = [
-        Obstacle(name, kind_of(name), plane=row)
-        for name, row in zip(world.plane_names, world.planes, strict=True)
-    ]
+    """All obstacles of a `World`: half-spaces, then `world.sources`. Objects `without` may be
+    touched: occluded space inside them goes. Fields are baked on first use: about half a second
+    each for a table top at 1 cm, 6 bytes per node while the world lives."""
+    planes = zip(world.plane_names, world.planes, strict=True)
+    found = [Obstacle(name, source_of(name).kind, plane=row) for name, row in planes]
     for name in world.sources:
-        field = source_field(world, name, without)
+        field = world.source_field(name, without)
         if field.source.flat[0] >= 0:
-            found.append(Obstacle(name, kind_of(name), field=field))
+            found.append(Obstacle(name, source_of(name).kind, field=field))
     return tuple(found)
 
 
 def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) -> SafetyMargins:
     """Return the margin between every moving link and every obstacle.
 
-    Each obstacle is asked by itself, so what stands behind something nearer is named,
-    too. All clearances are lower bounds by the checker's own rules, and none is below
-    `checker.clearance` but by rounding. Along a path the edges are sampled so closely
-    that no sphere moves more than `tolerance` to the nearest sample, and that much is
-    subtracted; for a tight bound over everything ask `min_clearance`. Joint limits do
-    not enter.
+    Each obstacle is asked by itself, so what stands behind something nearer is named, too. All
+    clearances are lower bounds by the checker's own rules, and none is below `checker.clearance`
+    but by rounding. Along a path no sphere moves more than `tolerance` to the nearest sample, and
+    that much is subtracted; for a tight bound ask `min_clearance`. Joint limits do not enter.
 
-    The first call bakes one distance field per obstacle (`obstacles_of`); after
-    that a configuration costs milliseconds, a path O(configurations x spheres x bodies).
+    The first call bakes one distance field per obstacle (`obstacles_of`); after that a
+    configuration costs milliseconds, a path O(configurations x spheres x bodies).
 
     Args:
         checker: a `CollisionChecker` over a `World`.
         q_or_path: (dof,) or (T, dof) joint values, radians or metres.
-        tolerance: see above, metres; for a path only.
+        tolerance: metres; for a path only.
 
     Raises:
-        RobotError: the shape is wrong, a value is not finite, or the path is too long
-            for the tolerance.
+        RobotError: see `waypoints`; or the path is too long for the tolerance.
     """
     checked_tolerance(tolerance)
     array = joint_values(q_or_path, checker.robot, "a path")
@@ -280,22 +252,15 @@ def safety_margin(checker: Any, q_or_path: Numbers, tolerance: float = 0.002) ->
 
 def margin_profile(
     checker: Any, path: Numbers, tolerance: float = 0.005
-) -> tuple[Float[np.ndarray, " n"], dict[str, Float[np.ndarray, " n"]]]:
-    """Return the clearance of the whole robot to each obstacle along a path, metres.
+) -> tuple[Values, dict[str, Values]]:
+    """Return the clearance of the whole robot to each obstacle along a path (T, dof), metres.
 
-    Contacts that a rule allows do not count.
-
-    Args:
-        checker: a `CollisionChecker` over a `World`.
-        path: (T, dof) waypoints.
-        tolerance: no sphere moves more than this, metres, to the nearest sample.
+    Contacts that a rule allows do not count. Errors as for `safety_margin`.
 
     Returns:
-        Places on the path (number of the edge plus the fraction of it), and for each
-        obstacle the clearance there; at the samples, nothing subtracted.
-
-    Raises:
-        RobotError: see `safety_margin`.
+        Places on the path (number of the edge plus the fraction of it), so close that no sphere
+        moves more than the tolerance (metres) to the nearest, and for each obstacle the clearance
+        there, nothing subtracted.
     """
     checked_tolerance(tolerance)
     Q, places = edges_of(checker, path).samples(tolerance)
@@ -319,20 +284,14 @@ def _rules(checker: Any) -> Iterator[tuple[frozenset[int], Int[np.ndarray, " l"]
 
 
 def _is_allowed(body: Obstacle, rule: frozenset[int]) -> bool:
-    return body.kind == "object" and int(body.name.split(":")[1]) in rule
+    return object_id(body.name) in rule
 
 
 def _scan(
-    checker: Any,
-    Q: Float[np.ndarray, "n dof"],
-    bodies: Sequence[Obstacle],
-    links: Int[np.ndarray, " l"],
+    checker: Any, Q: Rows, bodies: Sequence[Obstacle], links: Int[np.ndarray, " l"]
 ) -> Iterator[tuple[slice, int, Float[np.ndarray, "m l"], Int[np.ndarray, "m l"]]]:
-    """Yield, per piece of Q and number of a body, each link's bound and the sphere that has it.
-
-    As in the checker, a link's bound is the larger of that of its nearest sphere and
-    that of the ball around all its spheres.
-    """
+    """Yield, per piece of Q and number of a body, each link's bound and the sphere that has it:
+    the larger of that of its nearest sphere and that of the ball around all its spheres."""
     arrays = checker.robot.arrays
     spheres = [np.arange(arrays.link_start[k], arrays.link_start[k + 1]) for k in links]
     used = np.concatenate([*spheres, np.empty(0, dtype=np.int64)])
@@ -356,9 +315,7 @@ def _scan(
             yield rows, number, np.maximum(bound, whole - arrays.link_radius[links]), nearest
 
 
-def _nearest_pairs(
-    checker: Any, Q: Float[np.ndarray, "n dof"], places: Float[np.ndarray, " n"], slack: float
-) -> Iterator[BodyMargin]:
+def _nearest_pairs(checker: Any, Q: Rows, places: Values, slack: float) -> Iterator[BodyMargin]:
     for rule, links in _rules(checker):
         bodies = obstacles_of(checker.world, rule)
         shape = (len(bodies), len(links))
@@ -397,7 +354,7 @@ def _details(
     gradient = np.einsum("nk,nkj->nj", normal, jacobians)
     occupancy: list[float | None] = [None] * len(Q)
     entropy: list[float | None] = [None] * len(Q)
-    if body.kind not in {"support", "known"}:  # of those the map has nothing to say
+    if source_of(body.name).judged:
         occupancy = checker.world.map.occupancy(nearest).tolist()
         entropy = checker.world.map.entropy(nearest).tolist()
     names = "gradient", "nearest", "witness", "occupancy", "entropy"

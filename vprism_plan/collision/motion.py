@@ -1,28 +1,31 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""How far joints carry spheres along edges, and what that says of all that lies between.
-
-Bounds, not samples: the clearance over whole paths, and how far a motion stays safe.
-"""
+"""How far joints carry spheres along edges, and what that says of all that lies between: bounds,
+not samples, of the clearance over whole paths and of how far a motion stays safe."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from vprism_plan.collision.inputs import (
+from vprism_plan.collision.packing import (
     AT_MOST,
+    Configuration,
     Numbers,
+    Rows,
+    Waypoints,
+    ancestors,
     checked_tolerance,
     configuration,
     configurations,
+    reach_table,
     waypoints,
 )
-from vprism_plan.collision.packing import reach_table
 from vprism_plan.collision.reports import StateReport
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
 from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses
+from vprism_plan.world.grid import Points, Values
 
 _BATCH = 64  # configurations asked at once where clearance is too small to step by
 _HALVINGS = 60
@@ -31,38 +34,21 @@ _MOST_INTERVALS = 1_000_000  # of a path at once: what is kept of them fits in m
 
 @dataclass(frozen=True)
 class Edges:
-    """The straight edges of a path, and how far they can move anything.
+    """The straight edges of a path, and how far they can move anything."""
 
-    Attributes:
-        path: (T, dof) waypoints.
-        delta: (T - 1, dof) change of the joints along each edge, as the rows say.
-        motion: (T - 1,) upper bound of any sphere's way along each edge, metres.
-        pair_motion: the same for the change of any gap between two links.
-    """
+    path: Waypoints  # waypoints
+    delta: Float[np.ndarray, "e dof"]  # change of the joints along each edge, as the rows say
+    motion: Float[np.ndarray, " e"]  # upper bound of any sphere's way along each edge, metres
+    pair_motion: Float[np.ndarray, " e"]  # the same for the change of any gap between two links
 
-    path: Float[np.ndarray, "t dof"]
-    delta: Float[np.ndarray, "e dof"]
-    motion: Float[np.ndarray, " e"]
-    pair_motion: Float[np.ndarray, " e"]
-
-    def at(
-        self, edge: Int[np.ndarray, " n"], fraction: Float[np.ndarray, " n"]
-    ) -> Float[np.ndarray, "n dof"]:
+    def at(self, edge: Int[np.ndarray, " n"], fraction: Values) -> Rows:
         """Configurations at fractions of edges."""
         return self.path[edge] + fraction[:, None] * self.delta[edge]
 
-    def samples(
-        self, tolerance: float
-    ) -> tuple[Float[np.ndarray, "n dof"], Float[np.ndarray, " n"]]:
-        """Configurations with at most `tolerance` metres of motion to the nearest of them.
-
-        Returns:
-            The configurations, every waypoint among them, and their place on the path:
-            the edge's number plus the fraction of it.
-
-        Raises:
-            RobotError: that would be more than two hundred thousand.
-        """
+    def samples(self, tolerance: float) -> tuple[Rows, Values]:
+        """Configurations with at most `tolerance` metres of motion to the nearest of them, every
+        waypoint among them, and their place on the path: the edge's number plus the fraction of
+        it. RobotError if that would be more than two hundred thousand."""
         reach = np.maximum(self.motion, self.pair_motion)
         steps = np.maximum(1, np.ceil(reach / (2.0 * tolerance) - 1e-9)).astype(np.int64)
         if steps.sum() > AT_MOST:
@@ -80,12 +66,7 @@ class Edges:
 
 
 def edges_of(checker: Any, path: Numbers, single: bool = False) -> Edges:
-    """Check a path (T, dof) and bound its motion.
-
-    Raises:
-        RobotError: the shape is wrong, a value is not finite, or a sliding joint leaves
-            its limits, beyond which its motion has no bound.
-    """
+    """Check a path as `waypoints` does, and bound its motion."""
     array = waypoints(checker.robot, path, single)
     delta = np.diff(array, axis=0)
     return Edges(array, delta, *motion_bounds(checker.robot.arrays, delta))
@@ -94,12 +75,8 @@ def edges_of(checker: Any, path: Numbers, single: bool = False) -> Edges:
 def motion_bounds(
     arrays: KinematicArrays, delta: Float[np.ndarray, "e dof"]
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Bound how far any sphere moves, and how much any link pair's gap changes, metres.
-
-    Args:
-        arrays: the robot.
-        delta: (E, dof) changes of the joints along straight edges.
-    """
+    """Bound how far any sphere moves, and how much any link pair's gap changes, metres, where
+    the joints change by `delta` along straight edges."""
     table = reach_table(arrays)  # (frames, links): metres per unit, -1 where it moves nothing
     speed = np.abs(delta[:, np.maximum(arrays.q_index, 0)] * arrays.q_mult)
     speed[:, 0] = 0.0
@@ -126,22 +103,22 @@ def place_points(
 
 
 def sphere_jacobians(
-    arrays: KinematicArrays, Q: Float[np.ndarray, "n dof"], spheres: Int[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 dof"]]:
+    arrays: KinematicArrays, Q: Rows, spheres: Int[np.ndarray, " n"]
+) -> tuple[Points, Float[np.ndarray, "n 3 dof"]]:
     """Centres, metres, of one sphere at each configuration, and their derivatives.
 
-    The geometric Jacobian, metres per radian or metre: axis x (centre - joint) for a
-    revolute joint, the axis for a prismatic one, times the factor of joints that mimic.
+    The geometric Jacobian, metres per radian or metre: axis x (centre - joint) for a revolute
+    joint, the axis for a prismatic one, times the factor of joints that mimic.
     """
     R, t = frame_poses(arrays, Q)
-    rows = np.arange(len(Q))
-    frames = arrays.sphere_frame[spheres]
+    rows, frames = np.arange(len(Q)), arrays.sphere_frame[spheres]
     local = arrays.sphere_center[spheres]
     centers = np.einsum("nij,nj->ni", R[rows, frames], local) + t[rows, frames]
     jacobian = np.zeros((len(Q), 3, Q.shape[1]))
-    for f, carried in enumerate(_carried(arrays.parent)):
-        moved = np.flatnonzero(carried[frames])
-        if f == 0 or len(moved) == 0:
+    chains = ancestors(arrays.parent)
+    for f in range(1, len(chains)):
+        moved = np.flatnonzero([f in chains[g] for g in frames])
+        if len(moved) == 0:
             continue
         axis = R[moved, f] @ arrays.axis[f]
         if arrays.kind[f] != KIND_PRISMATIC:
@@ -150,31 +127,17 @@ def sphere_jacobians(
     return centers, jacobian
 
 
-def _carried(parent: Int[np.ndarray, " f"]) -> Bool[np.ndarray, "f f"]:
-    """Entry (f, g): whether frame g moves with frame f."""
-    table = np.eye(len(parent), dtype=bool)
-    for g in range(1, len(parent)):
-        table[:, g] |= table[:, parent[g]]
-    return table
-
-
-# --- bounds over whole motions --------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class PathClearance:
-    """Answer of `min_clearance`.
+    """Answer of `min_clearance`; metres.
 
     Attributes:
-        clearance: lower bound of the distance to the world at every point of the path,
-            edges included, metres.
-        tolerance: the smallest clearance of any configuration on the path lies at most
-            this much, metres, above `clearance`.
-        place: where the smallest clearance was found: number of the edge plus the
-            fraction of it.
+        clearance: lower bound of the distance to the world at every point of the path.
+        tolerance: the smallest clearance on the path lies at most this much above `clearance`.
+        place: where that was found: number of the edge plus the fraction of it.
         q: (dof,) that configuration; its clearance is `clearance + tolerance`.
         configurations: how many were computed.
-        motion: upper bound of any sphere's way along the path, metres.
+        motion: upper bound of any sphere's way along the path.
     """
 
     clearance: float
@@ -202,13 +165,10 @@ class SafeMotion:
     """Answer of `max_safe_motion`.
 
     Attributes:
-        fraction: the motion is valid from 0 up to this fraction of dq; 0 if q itself is
-            refused.
-        refused_at: a fraction, just after, at which it is refused; None if all of it is
-            valid.
-        tolerance: metres of motion. From `fraction` to `refused_at` nothing moves more
-            than this, nor from any point before `fraction` to a configuration that was
-            found valid or is proven so by its neighbours' clearances.
+        fraction: the motion is valid from 0 up to this fraction of dq; 0 if q itself is refused.
+        refused_at: a fraction, just after, at which it is refused; None if all of it is valid.
+        tolerance: metres of motion. From `fraction` to `refused_at` nothing moves more than this,
+            nor from any point before `fraction` to a configuration found valid or proven so.
         distance: upper bound of any sphere's way up to `fraction`, metres.
         reason: why it is refused at `refused_at`; None if it is not.
         configurations: how many were checked.
@@ -244,15 +204,12 @@ class SafeMotion:
 def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> PathClearance:
     """Return a lower bound of the clearance over a whole path, and where it is smallest.
 
-    Branch and bound over intervals of edges. If no sphere can move more than m from the
-    middle of an interval to anywhere in it, the distance there is at least c - m, where
-    c is the middle's clearance: distances are 1-Lipschitz and c is a lower bound. An
-    interval is closed when that exceeds what is found elsewhere less the tolerance, or
-    when m is at most the tolerance; otherwise its halves are asked. So no configuration
-    on the path is nearer to anything than `clearance`.
-
-    Computed clearances are bounds, which drop by up to a voxel between neighbours:
-    intervals are closed early only if they could not come in under the answer even so.
+    Branch and bound over intervals of edges. If no sphere can move more than m from the middle of
+    an interval to anywhere in it, the distance there is at least c - m, where c is the middle's
+    clearance: distances are 1-Lipschitz and c is a lower bound. An interval is closed when that
+    exceeds what is found elsewhere less the tolerance (by a voxel: computed clearances are bounds,
+    which drop by up to one between neighbours), or when m is at most the tolerance; otherwise its
+    halves are asked.
 
     Args:
         checker: a `CollisionChecker`.
@@ -260,8 +217,7 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
         tolerance: metres.
 
     Raises:
-        RobotError: the shape is wrong, a value is not finite, a sliding joint leaves its
-            limits, the tolerance is too small, or the path is too long for it.
+        RobotError: see `waypoints`; the tolerance is too small, or the path too long for it.
     """
     checked_tolerance(tolerance)
     edges = edges_of(checker, path)
@@ -300,20 +256,17 @@ def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> Pat
 def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.0005) -> SafeMotion:
     """Return how far from q along dq the checker's verdict stays "valid".
 
-    Conservative advancement: from a configuration with clearance c (less the margin)
-    and self gap g the motion cannot be refused before something moves by them. Where
-    they are within a voxel of what is required, or `max_risk` is set (of which no such
-    bound exists), it goes on in steps of at most `tolerance` metres of motion and asks
-    each. What is refused first is then bracketed by halving.
+    Conservative advancement: from a configuration with clearance c (less the margin) and self gap g
+    the motion cannot be refused before something moves by them. Where they are within a voxel of
+    what is required, or `max_risk` is set (of which no such bound exists), it goes on in steps of
+    at most `tolerance` metres of motion and asks each. What is refused first is bracketed by
+    halving.
 
     Args:
         checker: a `CollisionChecker`.
         q: (dof,) where the motion starts.
         dq: (dof,) change of the joints over the whole motion; no joint is wrapped.
-        tolerance: metres of motion.
-
-    Raises:
-        RobotError: a shape is wrong, a value is not finite, or the tolerance is too small.
+        tolerance: metres of motion, or RobotError if it is too small.
     """
     checked_tolerance(tolerance)
     march = _March(checker, q, dq, tolerance)
@@ -325,7 +278,7 @@ def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.
 
 
 class _March:
-    """Walks along a motion; all positions are fractions of it."""
+    """A walk along a motion; all positions are fractions of it."""
 
     def __init__(self, checker: Any, q: Numbers, dq: Numbers, tolerance: float) -> None:
         self.checker = checker
@@ -338,7 +291,7 @@ class _March:
         self.count = 0
         self.stepped = False
 
-    def at(self, fraction: float) -> Float[np.ndarray, "dof"]:
+    def at(self, fraction: float) -> Configuration:
         return np.asarray(self.q + fraction * self.dq)
 
     def run(self) -> tuple[float, float | None]:
@@ -378,10 +331,10 @@ class _March:
         """Return how far the clearances at a fraction reach, a voxel in reserve."""
         if self.checker.config.max_risk is not None:
             return 0.0
-        Q = self.at(fraction)[None]
-        config, spacing = self.checker.config, float(self.checker.world.field.spacing)
+        Q, config = self.at(fraction)[None], self.checker.config
         self.count += 1
-        room = float(self.checker.clearance_batch(Q)[0]) - config.margin - spacing
+        room = float(self.checker.clearance_batch(Q)[0]) - config.margin
+        room -= float(self.checker.world.field.spacing)
         gap = float(self.checker.self_clearance_batch(Q)[0]) - config.self_margin
         rates = (room, self.world_rate), (gap, self.pair_rate)
         return min([1.0, *(free / rate for free, rate in rates if rate > 0.0)])

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Packs a robot and a world into the few flat arrays the checking kernels read.
+"""Robots, worlds and joint values as the flat arrays that the checking kernels read.
 
-Besides copying, this turns every joint frame so that its axis is z (a rotation about a
-coordinate axis costs half of a general one) and bounds how far each joint can carry
-each link, which is what the continuous edge check advances by.
+Besides copying, this turns every joint frame so that its axis is z (a rotation about a coordinate
+axis costs half of a general one), bounds how far each joint can carry each link, which is what the
+continuous edge check advances by, and checks joint values as people write them, once, before
+anything is computed from them.
 """
 
 from collections.abc import Sequence
@@ -12,11 +13,24 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
+from vprism_plan._arguments import number
+from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import KinematicArrays
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, joint_values
+from vprism_plan.world.grid import Vector
+
+# Arrays of joint values: of one configuration, of many, of a path.
+Configuration = Float[np.ndarray, "dof"]
+Rows = Float[np.ndarray, "n dof"]
+Waypoints = Float[np.ndarray, "t dof"]
 
 _HEADER = 24
+AT_MOST = 200_000  # configurations that one query may ask about
+# An array, a tensor, a list or a tuple.
+Numbers = ArrayLike | Sequence[Any]
 
 # Kernel view of a world: distances at nodes and in blocks (metres, float32), (rules, x, y, z)
 # each, and the grid, plane and margin data.
@@ -31,7 +45,7 @@ class PackedRobot:
     ints: Int[np.ndarray, "i"]
 
 
-def _rotation_from_z(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def _rotation_from_z(axis: Vector) -> Float[np.ndarray, "3 3"]:
     """Return a rotation whose third column is the unit vector `axis`."""
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(helper, axis)
@@ -39,7 +53,7 @@ def _rotation_from_z(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.column_stack([x, np.cross(axis, x), axis])
 
 
-def _ancestors(parent: Int[np.ndarray, "f"]) -> list[list[int]]:
+def ancestors(parent: Int[np.ndarray, "f"]) -> list[list[int]]:
     """Return, for each frame, the chain from the base to the frame itself."""
     chains: list[list[int]] = []
     for frame, above in enumerate(parent):
@@ -49,7 +63,7 @@ def _ancestors(parent: Int[np.ndarray, "f"]) -> list[list[int]]:
 
 def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
     """Return the largest displacement of a prismatic frame within its limits, metres."""
-    if arrays.kind[frame] != 2:
+    if arrays.kind[frame] != KIND_PRISMATIC:
         return 0.0
     joint = int(arrays.q_index[frame])
     ends = arrays.q_mult[frame] * np.array([arrays.lower[joint], arrays.upper[joint]])
@@ -57,15 +71,11 @@ def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
 
 
 def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
-    """Bound the distance between each joint's axis and each link's sphere centres.
-
-    Entry (f, l) is an upper bound, over all configurations within the limits, on how
-    far joint f can move any sphere centre of link l per unit of its own motion
-    (metres per radian; 1 for prismatic joints); -1 where f does not move l. Offsets
-    along the chain are added up, which is the triangle inequality.
-    """
+    """Bound how far each joint can move any sphere centre of each link, over all configurations
+    within the limits, metres per unit of its own motion (1 for prismatic joints); -1 where it
+    does not move the link. Offsets along the chain are added up: the triangle inequality."""
     table = np.full((len(arrays.parent), len(arrays.link_frame)), -1.0)
-    chains = _ancestors(arrays.parent)
+    chains = ancestors(arrays.parent)
     for link, own in enumerate(arrays.link_frame):
         chain = chains[int(own)]
         rows = slice(int(arrays.link_start[link]), int(arrays.link_start[link + 1]))
@@ -83,7 +93,7 @@ def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
                 lever = across + _prismatic_travel(arrays, below) + reach
                 reach += float(np.linalg.norm(arrays.t_off[below]))
                 reach += _prismatic_travel(arrays, below)
-            table[frame, link] = 1.0 if arrays.kind[frame] == 2 else lever
+            table[frame, link] = 1.0 if arrays.kind[frame] == KIND_PRISMATIC else lever
     return table
 
 
@@ -108,18 +118,14 @@ def _frame_floats(arrays: KinematicArrays) -> tuple[np.ndarray, list[np.ndarray]
 def pack_robot(
     arrays: KinematicArrays, self_margin: float = 0.0, rules: Int[np.ndarray, "l"] | None = None
 ) -> PackedRobot:
-    """Pack a robot's kinematics, spheres and pairs for the kernels.
-
-    Args:
-        arrays: Flat description of the robot.
-        self_margin: Gap, metres, that link pairs must keep beyond touching.
-        rules: Which of the packed world's fields each link is checked against; None is
-            the first for all. Links that no joint moves are checked against none.
+    """Pack a robot for the kernels: its pairs keep `self_margin` (metres) beyond touching, and
+    `rules` say which of a packed world's fields each link is checked against (the first, if not
+    given). Links that no joint moves are checked against none.
 
     Raises:
-        RobotError: A prismatic joint has no finite limits, so its motion has no bound.
+        RobotError: a prismatic joint has no finite limits, so its motion has no bound.
     """
-    for frame in np.flatnonzero(arrays.kind == 2):
+    for frame in np.flatnonzero(arrays.kind == KIND_PRISMATIC):
         if not np.isfinite(_prismatic_travel(arrays, int(frame))):
             raise RobotError(
                 f"prismatic joint number {int(arrays.q_index[frame])} has infinite limits; "
@@ -166,11 +172,8 @@ def _turned(
 def block_bounds(
     distance: Float[np.ndarray, "nx ny nz"], spacing: float
 ) -> Float[np.ndarray, "bx by bz"]:
-    """Return a lower bound of the distance for everywhere in each block of 4 x 4 x 4 cells.
-
-    Every point of a block is within half a cell's diagonal of one of its nodes (those
-    on its faces included), and distance is 1-Lipschitz. Metres, rounded down to float32.
-    """
+    """Return a lower bound of the distance (metres) for everywhere in each block of 4 x 4 x 4
+    cells: every point is within half a cell's diagonal of a node, and distance is 1-Lipschitz."""
     lowest = distance
     for axis, n in enumerate(distance.shape):
         blocks = (n - 1) // 4 + 1
@@ -198,3 +201,69 @@ def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
     distance = np.ascontiguousarray([f.distance for f in fields], dtype=np.float32)
     blocks = np.ascontiguousarray([block_bounds(d, float(field.spacing)) for d in distance])
     return distance, blocks, floats
+
+
+def configuration(robot: Any, q: Numbers) -> Configuration:
+    """Return a configuration; whether it is finite is for a verdict to say."""
+    array = joint_values(q, robot, "a configuration")
+    if array.shape != (robot.dof,):
+        raise _wrong_shape(robot, array, "a configuration", f"({robot.dof},)")
+    return array
+
+
+def configurations(robot: Any, Q: Numbers, finite: bool = False) -> Rows:
+    """Return configurations; RobotError if the shape is wrong, or one that must be is not
+    finite."""
+    array = joint_values(Q, robot, "configurations")
+    if array.ndim != 2 or array.shape[1] != robot.dof:
+        raise _wrong_shape(robot, array, "configurations", f"(n, {robot.dof})")
+    if finite and not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise RobotError(
+            f"configuration {row} is {array[row].tolist()}: joint values that are not finite; "
+            "give finite ones"
+        )
+    return array
+
+
+def waypoints(robot: Any, path: Numbers, single: bool = False) -> Waypoints:
+    """Return the waypoints (T, dof), T >= 1, of a path whose motion can be bounded; with `single`,
+    take one configuration (dof,) for a path, too.
+
+    Raises:
+        RobotError: the shape is wrong, a value is not finite or far beyond any use (angles lose
+            their last digits there), or a sliding joint leaves its limits.
+    """
+    array = joint_values(path, robot, "a path")
+    rows = array[None] if single and array.ndim == 1 else array
+    if rows.ndim != 2 or rows.shape[1] != robot.dof or len(rows) == 0:
+        shapes = f"(T, {robot.dof}), T >= 1" + (f", or ({robot.dof},)" if single else "")
+        raise _wrong_shape(robot, array, "a path", shapes)
+    near = (np.abs(rows) <= FARTHEST).all(axis=1)
+    if not near.all():
+        row = int(np.flatnonzero(~near)[0])
+        raise RobotError(
+            f"waypoint {row} is {rows[row].tolist()}; give finite joint values of at most "
+            f"{FARTHEST:g}"
+        )
+    for j in np.unique(robot.arrays.q_index[robot.arrays.kind == KIND_PRISMATIC]):
+        low, high = rows[:, j].min(), rows[:, j].max()
+        if low < robot.lower[j] or high > robot.upper[j]:
+            raise RobotError(
+                f"prismatic joint {robot.joint_names[j]} goes from {low:.4f} to {high:.4f} m, "
+                f"outside its limits [{robot.lower[j]:.4f}, {robot.upper[j]:.4f}] m; its motion "
+                "is bounded only within them"
+            )
+    return rows
+
+
+def _wrong_shape(robot: Any, array: np.ndarray, what: str, shapes: str) -> RobotError:
+    return RobotError(
+        f"{what} has shape {array.shape}; {robot.name} needs {shapes}: "
+        f"{', '.join(robot.joint_names)}"
+    )
+
+
+def checked_tolerance(tolerance: float) -> float:
+    """Return a tolerance, metres of motion; RobotError if it is below a micrometre."""
+    return number("tolerance", tolerance, 1e-6, unit="metres of motion", error=RobotError)

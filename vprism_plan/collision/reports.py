@@ -9,32 +9,17 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-Kind = Literal[
-    "object", "support", "background", "occluded", "unobserved", "known",
-    "risk", "self", "joint_limit", "not_finite",
-]  # fmt: skip
+from vprism_plan.world.grid import Vector
+from vprism_plan.world.sources import SourceKind, spoken
+
+Kind = SourceKind | Literal["risk", "self", "joint_limit", "not_finite"]
 
 Point = tuple[float, float, float]
 
-# How a reason names what is no thing.
-SPOKEN = {
-    "background": "unlabelled clutter",
-    "occluded": "occluded space",
-    "support surface": "the support surface",
-    "unobserved": "unobserved space",
-}
 _ROBOT_LINK, _WORLD_OBJECT = 0, 1  # moveit_msgs/ContactInformation body types
 
 
-def kind_of(name: str) -> Kind:
-    """Return what the name of a source stands for."""
-    if name == "support surface":
-        return "support"
-    lead: Any = name.split(":", 1)[0]
-    return lead if lead in {"object", "background", "occluded", "unobserved"} else "known"
-
-
-def as_point(values: Float[np.ndarray, "3"]) -> Point:
+def as_point(values: Vector) -> Point:
     """Return three numbers as a tuple."""
     x, y, z = (float(v) for v in values)
     return x, y, z
@@ -42,25 +27,23 @@ def as_point(values: Float[np.ndarray, "3"]) -> Point:
 
 @dataclass(frozen=True)
 class Contact:
-    """One reason why a configuration is refused.
+    """One reason why a configuration is refused; metres, world frame.
 
     Attributes:
         kind: What the link touches.
         link: Link that touches (for a joint limit: the joint).
-        body: Name of what is touched: "object:3", "table", "background", "occluded",
-            another link, or the limit.
-        depth: How far the clearance falls short of what is required, metres (for a
-            joint limit: how far outside, radians or metres; for a risk: by how much its
-            upper bound exceeds `max_risk`).
+        body: Name of what is touched (see `world.sources`), another link, or the limit.
+        depth: How far the clearance falls short of what is required (for a joint limit: how far
+            outside, radians or metres; for a risk: by how much its upper bound exceeds `max_risk`).
         sphere: Index of the collision sphere, or -1.
-        position: Point of contact, world frame, metres.
-        normal: Unit direction that leads out of the contact, world frame.
-        probability: Largest P(occupied) of the map inside the sphere (for a risk: the
-            share of the posterior worlds in which this link touches this body); None where
-            the cause is not the map's to judge (self, limits, known geometry).
+        position: Point of contact.
+        normal: Unit direction that leads out of the contact.
+        probability: Largest P(occupied) of the map inside the sphere (for a risk: the share of the
+            posterior worlds in which this link touches this body); None where the cause is not the
+            map's to judge (self, limits, known geometry).
         detail: The rule that decided, in words.
-        required: Distance that was asked for, metres: the margin and the link's padding. So
-            `required - depth` is how far apart the two are, negative where they overlap.
+        required: Distance that was asked for: the margin and the link's padding. So `required -
+            depth` is how far apart the two are, negative where they overlap.
     """
 
     kind: Kind
@@ -86,7 +69,7 @@ class Contact:
         at = "" if not self.position else " at ({:.3f}, {:.3f}, {:.3f})".format(*self.position)
         sure = "" if self.probability is None else f", P(occupied) {self.probability:.2f}"
         why = f" ({self.detail})" if self.detail else ""
-        body = SPOKEN.get(self.body, self.body)
+        body = spoken(self.body)
         way = f"{1000 * abs(self.required - self.depth):.1f}"
         if way == "0.0":
             return f"{self.link} touches {body}{at}{sure}{why}"
@@ -112,15 +95,15 @@ class StateReport:
 
     Attributes:
         valid: The verdict; `contacts` is never empty when it is False.
-        contacts: Reasons, deepest first, one per link and touched body; what `max_risk`
-            refuses comes last.
+        contacts: Reasons, deepest first, one per link and touched body; what `max_risk` refuses
+            comes last.
         clearance: Lower bound of the distance to the world, metres; nan if q is not finite.
         self_clearance: Smallest gap between links that may collide, metres; inf if none.
         margin: Clearance that was required, metres.
-        shares: Share of the robot's sphere volume that lies in space that is "occluded",
-            "unobserved" or "outside" the grid: what nobody has seen.
+        shares: Share of the robot's sphere volume that nobody has seen: "occluded", "unobserved" or
+            "outside" the grid.
         policies: What the world does with those spaces ("occupied", "free", "posterior").
-        allowed: Contacts that the rules permit: links that touch objects they may touch.
+        allowed: Contacts that the rules permit.
         warnings: What is usable but odd about the world and the robot, with the remedy.
     """
 
@@ -169,7 +152,7 @@ class FirstContact:
     """What a path touches first, in some of the worlds where it touches anything.
 
     Attributes:
-        body: "object:3", "background", "occluded", "support surface", ...
+        body: as in `Contact`.
         link: link that touches it.
         waypoint: index of the waypoint where, or after which, it does.
         share: share of the colliding worlds; the shares of all causes sum to 1.
@@ -193,25 +176,25 @@ class RiskEstimate:
     """The joint probability that a path collides, over worlds drawn from the posterior.
 
     Attributes:
-        probability: share of the worlds in which any sphere touches anything anywhere on
-            the path; the same world for the whole path. A voxel counts as the ball inside
-            it. 1 if a certain obstacle is hit.
-        lower: Clopper-Pearson bound of the worlds that occupy a voxel's centre inside a
-            sphere, less what skipping certain voxels may add.
-        upper: Clopper-Pearson bound of the worlds with a voxel whose corners a sphere reaches,
-            and what skipping certain voxels may hide; above 0 even if no world collides.
-            Verdicts with `max_risk` go by it.
+        probability: share of the worlds in which any sphere touches anything anywhere on the path;
+            the same world for the whole path. A voxel counts as the ball inside it. 1 if a certain
+            obstacle is hit.
+        lower: Clopper-Pearson bound of the worlds that occupy a voxel's centre inside a sphere,
+            less what skipping certain voxels may add.
+        upper: Clopper-Pearson bound of the worlds with a voxel whose corners a sphere reaches, and
+            what skipping certain voxels may hide; above 0 even if no world collides. `max_risk`
+            goes by it.
         confidence: of the interval (lower, upper), two-sided; it holds the size of voxels.
         n_worlds: worlds drawn.
         seed: of the draws.
         per_waypoint: (T,) the same probability at each waypoint alone.
         certain: whether the path hits what is an obstacle in every world: support surface,
             background, unseen space by policy, known geometry.
-        spacing: no sphere centre moves more than this between two samples, metres; what
-            lies between samples is covered by growing the spheres.
-        configurations: samples taken.
-        trace, volume: find `first_contact` and `shares`, which cost more than the rest and
-            are often not asked for.
+        spacing: no sphere centre moves more than this between two samples, metres; what lies
+            between is covered by growing the spheres.
+        configurations: samples on the path.
+        trace, volume: find `first_contact` and `shares`, which cost more and are often not asked
+            for.
     """
 
     probability: float
@@ -280,12 +263,12 @@ class MotionReport:
 
     Attributes:
         valid: The verdict.
-        certified: Every point of the edge is covered by a computed clearance, so
-            nothing was left to sampling. False for a refused edge.
-        tolerance: Largest motion, metres, between any point of the edge and a
-            configuration known to be free (0 when certified).
-        collision_fraction: Where along the edge the collision that refused it was
-            found, 0 to 1; None when valid. Not necessarily the first one.
+        certified: Every point of the edge is covered by a computed clearance, so nothing was left
+            to sampling. False for a refused edge.
+        tolerance: Largest motion, metres, between any point of the edge and a configuration known
+            to be free (0 when certified).
+        collision_fraction: Where along the edge the collision that refused it was found, 0 to 1;
+            None when valid. Not necessarily the first one.
         configurations: How many configurations were checked.
         motion_bound: Upper bound of any sphere's path length along the edge, metres.
         state: Report of the refused configuration; None when valid.

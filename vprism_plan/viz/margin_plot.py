@@ -9,18 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vprism_plan.viz._figures import new_figure, object_color
+from vprism_plan.world.sources import object_id, source_of
 
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
     from vprism_plan.collision.margins import SafetyMargins
 
-# Obstacles that are no object: greys and blues that no object has, told apart by the line.
-_OTHERS: dict[str, tuple[Any, str]] = {
-    "support surface": ((0.35, 0.25, 0.15), "-"),
-    "background": ((0.45, 0.45, 0.45), "--"),
-    "occluded": ((0.10, 0.10, 0.10), ":"),
-    "unobserved": ((0.10, 0.10, 0.10), "-."),
-}
 _SHOWN = 0.4  # metres: farther is as good as far
 _PALE = 250.0  # millimetres from which a cell of the table is white
 
@@ -60,9 +54,8 @@ def margin_figure(
 
 def body_style(name: str) -> tuple[Any, str]:
     """Return colour and line style that stand for an obstacle in every picture of margins."""
-    if name.startswith("object:"):
-        return tuple(object_color(int(name.split(":")[1]))), "-"
-    return _OTHERS.get(name, ((0.15, 0.35, 0.55), "--"))
+    source, number = source_of(name), object_id(name)
+    return source.color if number is None else tuple(object_color(number)), source.line
 
 
 def _draw_profile(

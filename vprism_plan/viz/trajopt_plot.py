@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from vprism_plan.viz._figures import PALETTE, new_figure, object_color
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path, resample
+from vprism_plan.world.sources import source_of
 
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
@@ -125,7 +126,7 @@ def _draw_world(axis: Axes, world: Any, a: int, b: int) -> None:
     objects = len(world.map.object_ids)
     names = np.where(solid, field.source, -1)
     image = np.ones((field.distance.shape[a], field.distance.shape[b], 3))
-    unseen = {world.sources.index(name) for name in ("occluded", "unobserved")}
+    unseen = {k for k, name in enumerate(world.sources) if source_of(name).policy}
     order = [*sorted(unseen), *(k for k in range(objects, len(world.sources)) if k not in unseen)]
     for k in [*order, *range(objects)]:
         shadow = (names == k).any(axis=along)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A map in, obstacles out: fields that answer in microseconds, and meshes."""
 
-from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.config import Box, Cylinder, HalfSpace, KnownMesh, Sphere, WorldConfig
 from vprism_plan.world.distance import DistanceField
 from vprism_plan.world.grid import Grid
-from vprism_plan.world.known import Box, Cylinder, HalfSpace, KnownMesh, Sphere
 from vprism_plan.world.meshes import extract_meshes, extract_union_mesh
 from vprism_plan.world.posterior_worlds import PosteriorWorlds
 from vprism_plan.world.world import World

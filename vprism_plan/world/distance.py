@@ -2,47 +2,52 @@
 """Distance to the obstacles on a grid of nodes, and bounds between the nodes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int16, Int32, UInt8
+from jaxtyping import Float, Float32, Int16, UInt8
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
-from vprism_plan.world.grid import Grid
+from vprism_plan.world.grid import Grid, Index, Nodes, Points, Values, Vector
 
 if TYPE_CHECKING:
     import torch
 
+_MAX_LATTICE = 400_000_000
+
 
 @dataclass(frozen=True)
 class Lattice:
-    """Marked nodes of a lattice finer than the grid: where obstacles are.
+    """Marked nodes of a lattice finer than the grid: where obstacles are."""
 
-    Attributes:
-        labels: (X, Y, Z) uint8, 0 = not an obstacle. Obstacles are unions of cells, and
-            all corners of such a cell are marked; the point of a cell nearest to any
-            lattice node is one of its corners, so distances to marked nodes are exactly
-            the distances to the cells.
-        corner: (3,) position of labels[0, 0, 0] in lattice steps from the world origin.
-        factor: lattice steps per grid step.
-    """
-
+    # 0 = not an obstacle. Obstacles are unions of cells, and all corners of such a cell are
+    # marked; the point of a cell nearest to any lattice node is one of its corners, so distances
+    # to marked nodes are exactly the distances to the cells
     labels: UInt8[np.ndarray, "x y z"]
-    corner: Int[np.ndarray, " 3"]
-    factor: int
+    # position of labels[0, 0, 0] in lattice steps from the world origin
+    corner: Index
+    factor: int  # lattice steps per grid step
+
+
+def lattice_nodes(shape: Index, what: str) -> UInt8[np.ndarray, "x y z"]:
+    """Return unmarked nodes of a lattice; WorldError if it would be too large to be of use."""
+    if math.prod(int(n) for n in shape) > _MAX_LATTICE:
+        raise WorldError(
+            f"{what} spans {' x '.join(str(int(n)) for n in shape)} lattice nodes (at most "
+            f"{_MAX_LATTICE:,}); use a coarser resolution"
+        )
+    return np.zeros(tuple(shape), dtype=np.uint8)
 
 
 def distance_to_lattice(
     lattice: Lattice, grid: Grid
-) -> tuple[Float32[np.ndarray, "nx ny nz"], UInt8[np.ndarray, "nx ny nz"]]:
+) -> tuple[Nodes, UInt8[np.ndarray, "nx ny nz"]]:
     """Exact distance (metres, rounded down) from every node to the marked cells, and their label.
-
-    Infinite, with label 0, if nothing is marked.
-    """
+    Infinite, with label 0, if nothing is marked."""
     first = [int(v) for v in grid.first * lattice.factor - lattice.corner]
     nx, ny, nz = grid.shape
     X, Y, _ = lattice.labels.shape
@@ -62,14 +67,9 @@ def distance_to_lattice(
         ny,
         8,
     )
-    return _metres(squares, grid.spacing / step), nearest
-
-
-def _metres(squares: Int32[np.ndarray, "x y z"], spacing: float) -> Float32[np.ndarray, "x y z"]:
-    """Squared distances in lattice steps to metres; FAR means that there is nothing."""
-    distance = round_down(spacing * np.sqrt(squares.astype(np.float64)))
+    distance = round_down(grid.spacing / step * np.sqrt(squares.astype(np.float64)))
     distance[squares >= kernels.FAR] = np.inf
-    return distance
+    return distance, nearest
 
 
 def round_down(values: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*shape"]:
@@ -83,26 +83,26 @@ def round_down(values: Float[np.ndarray, "*shape"]) -> Float32[np.ndarray, "*sha
 class DistanceField:
     """Lower bounds of the signed distance to a set of obstacles, at the nodes of a grid.
 
-    All obstacles lie inside the grid's box, or in `beyond`, or else (if `solid_outside`)
-    everything outside of the box is an obstacle too.
+    All obstacles lie inside the grid's box, or in `beyond`, or else (if `solid_outside`) everything
+    outside of the box is an obstacle too.
 
     Attributes:
         origin: (3,) world position of node (0, 0, 0), metres.
         spacing: between nodes, metres.
-        distance: (nx, ny, nz) float32 metres, rounded down. Outside the obstacles the
-            exact distance to the cells that cover them; inside, at most the negative
-            distance to the nearest point outside.
-        source: (nx, ny, nz) int16, index into `sources` of the nearest obstacle; -1
-            everywhere if there is none.
+        distance: (nx, ny, nz) float32 metres, rounded down. Outside the obstacles the exact
+            distance to the cells that cover them; inside, at most the negative distance to the
+            nearest point outside.
+        source: (nx, ny, nz) int16, index into `sources` of the nearest obstacle; -1 everywhere if
+            there is none.
         sources: names of the obstacles.
         solid_outside: whether space outside the grid is an obstacle.
-        beyond: a coarser field of the obstacles outside the grid's box, whose bounds the
-            nodes here already hold; None if there are none.
+        beyond: a coarser field of the obstacles outside the grid's box, whose bounds the nodes here
+            already hold; None if there are none.
     """
 
-    origin: Float[np.ndarray, " 3"]
+    origin: Vector
     spacing: float
-    distance: Float32[np.ndarray, "nx ny nz"]
+    distance: Nodes
     source: Int16[np.ndarray, "nx ny nz"]
     sources: tuple[str, ...]
     solid_outside: bool = False
@@ -110,59 +110,39 @@ class DistanceField:
     _tensors: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
-    def upper(self) -> Float[np.ndarray, " 3"]:
+    def upper(self) -> Vector:
         """World position of the last node, metres."""
         return self.origin + self.spacing * (np.array(self.distance.shape) - 1)
 
-    def lower_bound(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    def lower_bound(self, points: Points) -> Values:
         """Lower bound of the signed distance from world points to the obstacles, metres.
 
-        Never above the true distance. Between nodes it uses that the squared distance
-        less |x|^2 is concave, d(x)^2 >= sum_i w_i d_i^2 - sum_i w_i |x - x_i|^2 with the
-        trilinear weights w_i, and near or inside obstacles that the signed distance
-        changes by at most the way travelled, d(x) >= max_i d_i - |x - x_i|.
-
-        Raises:
-            WorldError: a point is not finite.
+        Never above the true distance. Between nodes it uses that the squared distance less |x|^2 is
+        concave, d(x)^2 >= sum_i w_i d_i^2 - sum_i w_i |x - x_i|^2 with the trilinear weights w_i,
+        and near or inside obstacles that the signed distance changes by at most the way travelled,
+        d(x) >= max_i d_i - |x - x_i|. WorldError if a point is not finite.
         """
         points = checked_points(points)
-        out = np.empty(len(points))
-        run_chunked(
-            lambda s: kernels.lower_bounds(
-                points,
-                self.origin,
-                self.spacing,
-                self.distance,
-                self.solid_outside,
-                out,
-                s.start,
-                s.stop,
-            ),
-            len(points),
-            1 << 14,
-        )
+        out = lower_bounds(points, self, self.distance, self.solid_outside)
         if self.beyond is not None:
             outside = ((points < self.origin) | (points > self.upper)).any(axis=1)
             if outside.any():
                 out[outside] = np.minimum(out[outside], self.beyond.lower_bound(points[outside]))
         return out
 
-    def source_at(self, points: Float[np.ndarray, "n 3"]) -> Int16[np.ndarray, " n"]:
-        """Index into `sources` of the obstacle nearest to the grid node nearest to each point.
-
-        Raises:
-            WorldError: a point is not finite.
-        """
+    def source_at(self, points: Points) -> Int16[np.ndarray, " n"]:
+        """Index into `sources` of the obstacle nearest to the grid node nearest to each point;
+        WorldError if one is not finite."""
         steps = np.rint((checked_points(points) - self.origin) / self.spacing).astype(np.int64)
         nodes = np.clip(steps, 0, np.array(self.distance.shape) - 1)
-        return self.source[nodes[:, 0], nodes[:, 1], nodes[:, 2]]
+        return self.source[tuple(nodes.T)]
 
     def distance_at(self, points: "torch.Tensor") -> "torch.Tensor":
         """Trilinear interpolation of the node distances, differentiable; (..., 3) to (...,).
 
-        For gradients, not for verdicts: it may exceed the true distance by up to a
-        voxel. Outside the grid: the distance to the box combined with the distance at
-        its nearest point, as for `lower_bound`.
+        For gradients, not for verdicts: it may exceed the true distance by up to a voxel. Outside
+        the grid: the distance to the box combined with the distance at its nearest point, as for
+        `lower_bound`.
         """
         import torch
 
@@ -198,7 +178,21 @@ class DistanceField:
         return self._tensors[key]
 
 
-def checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
+def lower_bounds(points: Points, grid: Any, distance: Nodes, solid_outside: bool = False) -> Values:
+    """`DistanceField.lower_bound` for distances at the nodes of a grid, nothing beyond it."""
+    out = np.empty(len(points))
+
+    def look(piece: slice) -> None:
+        kernels.lower_bounds(
+            points, grid.origin, grid.spacing, distance, solid_outside, out,
+            piece.start, piece.stop,
+        )  # fmt: skip
+
+    run_chunked(look, len(points), 1 << 14)
+    return out
+
+
+def checked_points(points: Any) -> Points:
     """Contiguous, writeable float64 points (n, 3) as kernels take them; WorldError if they are
     not that, or not finite."""
     array = np.require(points, np.float64, ["C", "W"])
@@ -214,7 +208,7 @@ def checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
 class NodeDistances:
     """Unsigned distance from every node to one obstacle set, and which part is nearest."""
 
-    distance: Float32[np.ndarray, "nx ny nz"]
+    distance: Nodes
     source: Int16[np.ndarray, "nx ny nz"]
 
 
@@ -229,13 +223,19 @@ def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
     return NodeDistances(distance, source)
 
 
-def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
-    """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
+def at_nodes(grid: Grid, bound: Callable[[np.ndarray], np.ndarray]) -> Nodes:
+    """Bounds of a distance at all nodes, at least 0 and rounded down."""
     distance = np.empty(grid.shape, dtype=np.float32)
     for start in range(0, grid.shape[0], 16):
         stop = min(start + 16, grid.shape[0])
-        bound = np.maximum(field.lower_bound(grid.slab(start, stop)), 0.0)
-        distance[start:stop] = round_down(bound).reshape(-1, *grid.shape[1:])
+        outside = np.maximum(bound(grid.slab(start, stop)), 0.0)
+        distance[start:stop] = round_down(outside).reshape(-1, *grid.shape[1:])
+    return distance
+
+
+def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
+    """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
+    distance = at_nodes(grid, field.lower_bound)
     ends = (np.stack([grid.origin, grid.upper]) - field.origin) / field.spacing
     nearest = [
         np.clip(np.rint(np.linspace(first, last, n)), 0, size - 1).astype(int)
@@ -251,21 +251,14 @@ def finish(
     solid_outside: bool,
     beyond: DistanceField | None = None,
 ) -> DistanceField:
-    """Give nodes inside obstacles their depth and make the field.
-
-    A node at distance 0 is at most as far from open space as from the nearest node
-    with a positive distance.
-    """
+    """Give nodes inside obstacles their depth and make the field: a node at distance 0 is at
+    most as far from open space as from the nearest node with a positive distance."""
     distance = nodes.distance.copy()
     inside = distance <= 0.0
     reach = float(np.linalg.norm(grid.upper - grid.origin)) + grid.spacing
     if inside.any():
-        box = _bounding(inside, margin=1)
-        part = Grid(
-            grid.spacing,
-            grid.first + np.array([s.start for s in box]),
-            _shape3(inside[box].shape),
-        )
+        box = bounding(inside, 1)
+        part = Grid(grid.spacing, grid.first + np.array([s.start for s in box]), inside[box].shape)
         # Nodes on the rim of the box are the nearest outside ones only if they are outside.
         depth, _ = distance_to_lattice(
             Lattice((~inside[box]).astype(np.uint8), part.first, 1), part
@@ -281,19 +274,11 @@ def finish(
     )  # fmt: skip
 
 
-def _bounding(mask: np.ndarray, margin: int) -> tuple[slice, slice, slice]:
+def bounding(mask: np.ndarray, margin: int) -> tuple[slice, ...]:
     """Slices of the box of the true entries, grown by a margin within the array."""
-    slices = []
-    for axis in range(3):
-        others = tuple(a for a in range(3) if a != axis)
-        hits = np.flatnonzero(mask.any(axis=others))
-        slices.append(
-            slice(max(0, int(hits[0]) - margin), min(mask.shape[axis], int(hits[-1]) + 1 + margin))
-        )
-    return slices[0], slices[1], slices[2]
-
-
-def _shape3(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    if len(shape) != 3 or math.prod(shape) == 0:
-        raise WorldError(f"a grid needs three non-empty axes, got shape {shape}")
-    return shape[0], shape[1], shape[2]
+    axes = range(mask.ndim)
+    hits = [np.flatnonzero(mask.any(axis=tuple(b for b in axes if b != a))) for a in axes]
+    return tuple(
+        slice(max(0, int(where[0]) - margin), min(n, int(where[-1]) + 1 + margin))
+        for where, n in zip(hits, mask.shape, strict=True)
+    )

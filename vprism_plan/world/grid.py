@@ -6,12 +6,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from vprism_plan.errors import WorldError
 from vprism_plan.perception import Plane
-from vprism_plan.world.config import WorldConfig
-from vprism_plan.world.known import HalfSpace
+from vprism_plan.world.config import HalfSpace, WorldConfig
+
+# Arrays by what they hold; metres, world frame.
+Vector = Float[np.ndarray, " 3"]
+Points = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, " n"]
+Chosen = Bool[np.ndarray, " n"]
+Image = Float[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+Balls = Float[np.ndarray, "s 4"]
+Nodes = Float32[np.ndarray, "nx ny nz"]
+Index = Int[np.ndarray, " 3"]
+Shape3 = tuple[int, int, int]
+Slices = tuple[slice, slice, slice]
 
 _REACH = 0.6  # metres of room around the observed objects
 _UNDER = 0.02  # metres below the support plane
@@ -28,29 +40,43 @@ _FAR_BELOW = 0.5  # metres below it: its end must not count where the support su
 class Grid:
     """Nodes at spacing * (first + (i, j, k)) for 0 <= (i, j, k) < shape.
 
-    The origin is a whole number of steps from the world's origin, so that every finer
-    lattice of the world shares its nodes.
+    The origin is a whole number of steps from the world's origin, so that every finer lattice of
+    the world shares its nodes.
     """
 
     spacing: float
-    first: Int[np.ndarray, " 3"]
-    shape: tuple[int, int, int]
+    first: Index
+    shape: Shape3
 
     @property
-    def origin(self) -> Float[np.ndarray, " 3"]:
+    def origin(self) -> Vector:
         """World position of node (0, 0, 0), metres."""
         return self.spacing * self.first.astype(np.float64)
 
     @property
-    def upper(self) -> Float[np.ndarray, " 3"]:
+    def upper(self) -> Vector:
         """World position of the last node, metres."""
         return self.spacing * (self.first + np.array(self.shape) - 1).astype(np.float64)
 
-    def slab(self, start: int, stop: int) -> Float[np.ndarray, "n 3"]:
+    def slab(self, start: int, stop: int) -> Points:
         """World positions of the nodes with start <= i < stop, in memory order."""
         sizes = (stop - start, *self.shape[1:])
         nodes = np.moveaxis(np.indices(sizes), 0, -1).reshape(-1, 3)
         return self.spacing * (nodes + self.first + np.array([start, 0, 0])).astype(np.float64)
+
+
+def window(low: np.ndarray, high: np.ndarray) -> Slices:
+    """Slices of an array from one corner up to another."""
+    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return x, y, z
+
+
+def corners(shape: tuple[int, ...]) -> list[tuple[slice, ...]]:
+    """Windows of an array of nodes: the eight corners of all its cells."""
+    return [
+        tuple(slice(bit, n - 1 + bit) for bit, n in zip(bits, shape, strict=True))
+        for bits in np.ndindex(2, 2, 2)
+    ]
 
 
 def is_level(plane: Plane | None) -> bool:
@@ -75,10 +101,8 @@ def _default_box(map_: Any, bounded: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grid_beyond(inner: Grid, plane: Plane | None, bounded: bool) -> Grid:
-    """Choose coarse nodes around a grid, as far as an arm beside the objects can reach.
-
-    Under a level table the support surface answers, unless it is `bounded`.
-    """
+    """Choose coarse nodes around a grid, as far as an arm beside the objects can reach. Under a
+    level table the support surface answers, unless it is `bounded`."""
     lower, upper = inner.origin - _FAR_REACH, inner.upper + _FAR_REACH
     if is_level(plane):
         lower[2] = inner.origin[2] - (_FAR_REACH if bounded else _FAR_BELOW)
@@ -88,11 +112,7 @@ def grid_beyond(inner: Grid, plane: Plane | None, bounded: bool) -> Grid:
     return Grid(spacing, first, (x, y, z))
 
 
-def choose_grid(
-    map_: Any,
-    config: WorldConfig,
-    level_box: tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None,
-) -> Grid:
+def choose_grid(map_: Any, config: WorldConfig, level_box: tuple[Vector, Vector] | None) -> Grid:
     """Choose the nodes: the wanted bounds, the level set and all known geometry.
 
     Raises:

@@ -1,22 +1,26 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The set {P(occupied) >= level} of a map, covered by small cells.
 
-An octree over the box in which the map has any support: a cell is dropped when the
-log-odds cannot reach the level in it, kept whole when they cannot fall below it, and
-divided otherwise. On a cell of edge h the log-odds g differ from the trilinear
-interpolation of their corners by at most sum_a h^2/8 max|g_aa|; the second derivatives
-come from the 27 points that dividing the parent evaluates anyway. They are finite
-differences of a smooth function, counted twice: not a proof for an arbitrary one.
+An octree over the box in which the map has any support: a cell is dropped when the log-odds cannot
+reach the level in it, kept whole when they cannot fall below it, and divided otherwise. On a cell
+of edge h the log-odds g differ from the trilinear interpolation of their corners by at most sum_a
+h^2/8 max|g_aa|; the second derivatives come from the 27 points that dividing the parent evaluates
+anyway. They are finite differences of a smooth function, counted twice: not a proof for an
+arbitrary one.
 """
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from vprism_plan._kernels import world as kernels
 from vprism_plan.errors import WorldError
+from vprism_plan.world.distance import Lattice, lattice_nodes
+from vprism_plan.world.grid import Chosen, Index, Points, Values
 
 # How far the second derivatives may exceed their finite-difference estimate.
 _CURVATURE_SAFETY = 2.0
@@ -26,8 +30,8 @@ _CHUNK = 1 << 16
 # Cells of a surface, a kilobyte each: about 3 square metres at a resolution of 1 mm.
 _MOST_CELLS = 8_000_000
 
-_OFFSETS = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(27, 3)
-_CHILDREN = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+_OFFSETS = np.indices((3, 3, 3)).reshape(3, 27).T
+_CHILDREN = np.indices((2, 2, 2)).reshape(3, 8).T
 # Values of the parabola through three nodes at the nodes and half way between them.
 _HALVES = np.array(
     [[1, 0, 0], [0.375, 0.75, -0.125], [0, 1, 0], [-0.125, 0.75, 0.375], [0, 0, 1]], dtype=float
@@ -36,45 +40,34 @@ _HALVES = np.array(
 
 @dataclass(frozen=True)
 class Cells:
-    """Cells of one size of the octree.
+    """Cells of one size of the octree."""
 
-    Attributes:
-        index: (n, 3) lowest corner, in units of the finest lattice spacing.
-        size: edge length in the same units.
-        label: (n,) most probable object (class 1..C) at the most occupied corner of the
-            evaluated cell that contains it.
-        around: (n, 8) the same at each corner of that cell, 0 where it is not occupied.
-    """
-
-    index: Int[np.ndarray, "n 3"]
-    size: int
+    index: Int[np.ndarray, "n 3"]  # lowest corner, in units of the finest lattice spacing
+    size: int  # edge length in the same units
+    # most probable object (class 1..C) at the most occupied corner of the evaluated cell that
+    # contains it
     label: UInt8[np.ndarray, " n"]
+    # the same at each corner of that cell, 0 where it is not occupied
     around: UInt8[np.ndarray, "n 8"]
 
-    def select(self, chosen: Bool[np.ndarray, " n"]) -> "Cells":
+    def select(self, chosen: Chosen) -> "Cells":
         """Return only the chosen cells."""
         return Cells(self.index[chosen], self.size, self.label[chosen], self.around[chosen])
 
 
 @dataclass(frozen=True)
 class LevelSet:
-    """A cover of the level set, on a lattice whose node (0, 0, 0) is the world origin.
+    """A cover of the level set, on a lattice whose node (0, 0, 0) is the world origin."""
 
-    Attributes:
-        spacing: of the lattice, metres.
-        inner: cells that lie wholly inside, by size.
-        border: cells of one lattice step in which the level may be reached.
-        evaluations: how many points of the map were evaluated.
-    """
+    spacing: float  # of the lattice, metres
+    # those that lie wholly inside, by size, and last those of one lattice step in which the level
+    # may be reached
+    cells: tuple[Cells, ...]
+    evaluations: int  # how many points of the map were evaluated
 
-    spacing: float
-    inner: tuple[Cells, ...]
-    border: Cells
-    evaluations: int
-
-    def box(self) -> tuple[Int[np.ndarray, " 3"], Int[np.ndarray, " 3"]] | None:
+    def box(self) -> tuple[Index, Index] | None:
         """First and last lattice node of the cover, or None if it is empty."""
-        parts = [cells for cells in (*self.inner, self.border) if len(cells.index)]
+        parts = [cells for cells in self.cells if len(cells.index)]
         if not parts:
             return None
         lower = np.min([cells.index.min(axis=0) for cells in parts], axis=0)
@@ -82,15 +75,13 @@ class LevelSet:
         return lower, upper
 
 
-def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Values:
     """log P(occupied) / P(empty) from class probabilities (class 0 is empty)."""
     empty = np.clip(probabilities[:, 0], 1e-18, 1.0)
     return np.log(np.clip(probabilities[:, 1:].sum(axis=1), 1e-18, None)) - np.log(empty)
 
 
-def _evaluate(
-    map_: Any, points: Float[np.ndarray, "n 3"], level: float
-) -> tuple[Float[np.ndarray, " n"], UInt8[np.ndarray, " n"]]:
+def _evaluate(map_: Any, points: Points, level: float) -> tuple[Values, UInt8[np.ndarray, " n"]]:
     """Log-odds less those of the level, and the most probable object class, at points."""
     values = np.empty(len(points))
     labels = np.empty(len(points), dtype=np.uint8)
@@ -110,26 +101,16 @@ def _unique_nodes(
     """Distinct lattice nodes, and where each given one is among them."""
     low = nodes.reshape(-1, 3).min(axis=0)
     extent = nodes.reshape(-1, 3).max(axis=0) - low + 1
-    shifted = nodes - low
-    keys = (shifted[..., 0] * extent[1] + shifted[..., 1]) * extent[2] + shifted[..., 2]
+    keys = np.ravel_multi_index(tuple(np.moveaxis(nodes - low, -1, 0)), tuple(extent))
     unique, inverse = np.unique(keys.reshape(-1), return_inverse=True)
-    rest, z = np.divmod(unique, extent[2])
-    x, y = np.divmod(rest, extent[1])
-    return np.stack([x, y, z], axis=1) + low, inverse.reshape(keys.shape)
+    found = np.stack(np.unravel_index(unique, tuple(extent)), axis=1)
+    return found + low, inverse.reshape(keys.shape)
 
 
-def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Float[np.ndarray, " n"]:
+def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Values:
     """Sum over the axes of the largest second difference."""
-    total = np.zeros(len(g))
-    for axis in (1, 2, 3):
-        second = np.abs(np.diff(g, n=2, axis=axis))
-        total += second.reshape(len(g), -1).max(axis=1, initial=0.0)
-    return total
-
-
-def _range(g: Float[np.ndarray, "n 3 3 3"]) -> Float[np.ndarray, " n"]:
-    flat = g.reshape(len(g), -1)
-    return np.asarray(flat.max(axis=1) - flat.min(axis=1))
+    second = (np.abs(np.diff(g, n=2, axis=axis)) for axis in (1, 2, 3))
+    return np.sum([part.max(axis=(1, 2, 3), initial=0.0) for part in second], axis=0)
 
 
 def lattice_refinement(resolution: float, kernel_length: float) -> int:
@@ -141,16 +122,13 @@ def lattice_refinement(resolution: float, kernel_length: float) -> int:
 
 
 def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
-    """Cover {P(occupied) >= level} with cells of a lattice of the given spacing.
+    """Cover {P(occupied) >= level} with cells, the finest of them `spacing` (metres) wide.
 
-    Args:
-        map_: `predict_proba`, `support_bounds`, `unsupported_occupancy`, `kernel_length`.
-        spacing: of the finest lattice, metres; its node (0, 0, 0) is the world origin.
-        level: probability.
+    `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`.
 
     Raises:
-        WorldError: the map says "occupied" where it has no evidence at all, or the cells would
-            fill the memory.
+        WorldError: the map says "occupied" where it has no evidence at all, or the cells would fill
+            the memory.
     """
     if map_.unsupported_occupancy >= level:
         raise WorldError(
@@ -184,13 +162,12 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         owners = labels[where].reshape(-1, 3, 3, 3)
         step = spacing * size / map_.kernel_length
         if size == 2:
-            return LevelSet(spacing, tuple(inner), _border(index, g, owners, step), evaluations)
+            return LevelSet(spacing, (*inner, _border(index, g, owners, step)), evaluations)
         inside, border = _divide(index, size, g, owners, step)
         inner.append(inside)
         index = border.index
         if len(index) == 0:
-            nothing = Cells(index, 1, border.label, border.around)
-            return LevelSet(spacing, tuple(inner), nothing, evaluations)
+            return LevelSet(spacing, tuple(inner), evaluations)
 
 
 def _divide(
@@ -200,12 +177,11 @@ def _divide(
     owners: UInt8[np.ndarray, "n 3 3 3"],
     step: float,
 ) -> tuple[Cells, Cells]:
-    """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide.
-
-    Children with more than one object at their corners are divided too.
-    """
+    """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
+    those with more than one object at their corners."""
+    spread = np.ptp(g, axis=(1, 2, 3))
     # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
-    slack = _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * _range(g) + _SLACK
+    slack = _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
     inside, border = [], []
     for child in _CHILDREN:
         block = (slice(None), *(slice(c, c + 2) for c in child))
@@ -219,15 +195,10 @@ def _divide(
 
 
 def _ownership(
-    corners: Float[np.ndarray, "n 8"],
-    owners: UInt8[np.ndarray, "n 8"],
-    slack: Float[np.ndarray, " n"],
+    corners: Float[np.ndarray, "n 8"], owners: UInt8[np.ndarray, "n 8"], slack: Values
 ) -> tuple[UInt8[np.ndarray, " n"], UInt8[np.ndarray, "n 8"]]:
-    """Owner at the most occupied corner, and at all corners that may be occupied.
-
-    Off the objects the likeliest of them says little: counted there, the skin of one
-    object would belong to another.
-    """
+    """Owner at the most occupied corner, and at all corners that may be occupied: counted
+    elsewhere, the skin of one object would belong to another."""
     best = corners.argmax(axis=1)
     rows = np.arange(len(corners))
     around = np.where(corners >= -slack[:, None], owners, np.uint8(0))
@@ -241,14 +212,13 @@ def _border(
     owners: UInt8[np.ndarray, "n 3 3 3"],
     step: float,
 ) -> Cells:
-    """Divide cells of edge 4, known at every second node, into those of edge 1 that count.
-
-    The map is not evaluated again: a parabola through three nodes at a distance h is off
-    by at most h^3 / (9 sqrt 3) |g_aaa| per axis, and |g_aaa| is about 3 |g_a| / l^2.
-    """
+    """Divide cells of edge 4, known at every second node, into those of edge 1 that count. The map
+    is not evaluated again: a parabola through three nodes at a distance h is off by at most h^3 /
+    (9 sqrt 3) |g_aaa| per axis, and |g_aaa| is about 3 |g_a| / l^2."""
     fine = np.einsum("ai,bj,ck,nijk->nabc", _HALVES, _HALVES, _HALVES, g, optimize=True)
     # Second differences at half the spacing are a quarter of those in `g`.
-    slack = _CURVATURE_SAFETY * _curvature(g) / 32.0 + 0.3 * step**2 * _range(g) + _SLACK
+    spread = np.ptp(g, axis=(1, 2, 3))
+    slack = _CURVATURE_SAFETY * _curvature(g) / 32.0 + 0.3 * step**2 * spread + _SLACK
     kept = []
     for child in np.ndindex(4, 4, 4):
         corners = fine[(slice(None), *(slice(c, c + 2) for c in child))].reshape(len(g), 8)
@@ -261,9 +231,34 @@ def _border(
 
 
 def _join(parts: list[Cells]) -> Cells:
-    return Cells(
-        np.concatenate([part.index for part in parts]),
-        parts[0].size,
-        np.concatenate([part.label for part in parts]),
-        np.concatenate([part.around for part in parts]),
-    )
+    columns = zip(*((part.index, part.label, part.around) for part in parts), strict=True)
+    index, label, around = (np.concatenate(column) for column in columns)
+    return Cells(index, parts[0].size, label, around)
+
+
+def rasterize_level_set(
+    level_set: LevelSet, factor: int, classes: Collection[int] | None = None
+) -> Lattice | None:
+    """Mark the corners of the cells of a level set with the object class found there.
+
+    With `classes`, only, and the whole of, cells in which one of these is the most probable at some
+    corner. None if there is no cell.
+    """
+    cells = level_set.cells
+    if classes is not None:
+        cells = tuple(_owned(part, classes) for part in cells)
+    box = LevelSet(level_set.spacing, cells, 0).box()
+    if box is None:
+        return None
+    lower, upper = box
+    labels = lattice_nodes(upper - lower + 1, "the level set")
+    for part in cells:
+        kernels.fill_blocks(labels, part.index - lower, part.label, part.size)
+    return Lattice(labels, lower, factor)
+
+
+def _owned(cells: Cells, classes: Collection[int]) -> Cells:
+    """Cells with one of the classes at some corner around them, relabelled with it."""
+    mine = np.isin(cells.around, np.array(sorted(classes), dtype=cells.around.dtype))
+    label = np.where(mine, cells.around, 0).max(axis=1, initial=0)
+    return Cells(cells.index, cells.size, label, cells.around).select(label > 0)

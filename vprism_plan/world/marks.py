@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Obstacles that no object of the map accounts for: what nobody saw, and seen surfaces."""
+"""Obstacles that no object of the map accounts for, as marked nodes of a lattice: what nobody
+saw, seen surfaces, known meshes."""
 
+import math
 from collections.abc import Collection, Iterator
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
+from scipy import ndimage
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.world import visibility
-from vprism_plan.world.config import OccludedPolicy, WorldConfig
-from vprism_plan.world.distance import Lattice
-from vprism_plan.world.grid import Grid
+from vprism_plan.world.config import KnownMesh, OccludedPolicy, WorldConfig
+from vprism_plan.world.distance import Lattice, bounding, lattice_nodes
+from vprism_plan.world.grid import Grid, Nodes, Points, Values, Vector, corners, window
 from vprism_plan.world.seen import (
     Cone,
     Surface,
@@ -23,24 +26,19 @@ from vprism_plan.world.seen import (
     off_level_set,
     surface_points,
 )
+from vprism_plan.world.sources import LAST_MARK, MARKED
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
-# Marks on that lattice; where several apply the largest wins.
-UNOBSERVED, OCCLUDED, BACKGROUND = 1, 2, 3  # and 3 + k: seen surface of class k
 
 
 class Evidence:
     """What the views of a map say of space: what was seen, what hides, where nobody looked.
 
-    Args:
-        map_: the map.
-        config: policies, and what counts as seen.
-
     Attributes:
         views: ready to be asked of cells.
         below: the same for which the support plane hides things, too; None if it never ends.
         without_depth: labels without any return, sorted: no class of the map. Their marks follow
-            those of the classes, BACKGROUND + C + 1 and on.
+            those of the classes, LAST_MARK + C + 1 and on.
     """
 
     def __init__(self, map_: Any, config: WorldConfig) -> None:
@@ -53,47 +51,51 @@ class Evidence:
         self.without_depth = tuple(sorted(found - set(map_.object_ids)))
 
     @cached_property
-    def _clutter(self) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-        config, m = self._config, self._map
+    def _clutter(self) -> tuple[Points, Values]:
+        config = self._config
         return visibility.background_points(
-            m.views, m.plane, config.background_height, config.lone_share, self.bounded
-        )
+            self._map.views, self._map.plane, config.background_height, config.lone_share,
+            self.bounded,
+        )  # fmt: skip
 
     @cached_property
     def _surfaces(self) -> list[Surface]:
-        m = self._map
-        return surface_points(m.views, m.object_ids, m.plane, self.bounded)
+        return surface_points(self._map, self.bounded)
 
     @cached_property
     def _cones(self) -> list[list[Cone]]:
         return [lost_cones(view, self._map.plane) for view in self._map.views]
 
     def marks(
-        self,
-        occluded: OccludedPolicy,
-        grid: Grid,
-        objects: Float32[np.ndarray, "nx ny nz"] | None,
-        inner: Grid | None = None,
+        self, occluded: OccludedPolicy, grid: Grid, objects: Nodes | None, inner: Grid | None = None
     ) -> Lattice:
-        """Mark occluded and unobserved cells, as the policies say, and seen surfaces that no
-        object of the map holds.
-
-        Args:
-            occluded: what to do with occluded space.
-            grid: nodes of the field; the marks are `CELLS` times finer.
-            objects: distance from its nodes to the level set, metres; None marks all that was
-                seen of the objects.
-            inner: another grid whose box is not to be marked.
-        """
+        """Mark, `CELLS` times finer than the grid, occluded (by that policy) and unobserved cells
+        outside the box of `inner`, and seen surfaces that no object of the map holds, by the
+        distance of the grid's nodes to the level set (metres); all that was seen of the objects, if
+        that is not given."""
         spacing = grid.spacing / CELLS
         cells = tuple(CELLS * (n - 1) for n in grid.shape)
         shape = (cells[0], cells[1], cells[2])
         nodes = np.zeros(tuple(n + 1 for n in shape), dtype=np.uint8)
         if occluded != "free" or self._config.unobserved != "free":
-            status = self._status(occluded, grid.origin, spacing, shape)
+            place = self._map.plane, grid.origin, spacing, shape
+            if self.below is None:
+                status = visibility.classify_cells(self.views, *place)
+            else:
+                status = visibility.classify_cells_around(self.views, self.below, *place)
+            if occluded == "posterior":
+                _trust_posterior(self._map, self._config, status, grid.origin, spacing)
             if inner is not None:
-                status[_cells_within(inner, grid.origin, spacing, shape)] = kernels.FREE
-            marks = self._marks_of_status(occluded)
+                # Cells that lie wholly inside the other box.
+                low = np.ceil((inner.origin - grid.origin) / spacing - 1e-9)
+                high = np.floor((inner.upper - grid.origin) / spacing + 1e-9)
+                low = np.clip(low, 0, shape)
+                status[window(low, np.clip(high, low, shape))] = kernels.FREE
+            shadow = 0 if occluded == "free" else MARKED["occluded"]
+            unseen = 0 if self._config.unobserved == "free" else MARKED["unobserved"]
+            marks = np.zeros(4, dtype=np.uint8)
+            marks[kernels.OCCLUDED], marks[kernels.UNOBSERVED] = shadow, unseen
+            marks[kernels.PARTLY] = shadow or unseen
             run_chunked(
                 lambda s: kernels.mark_corners(status, marks, nodes, s.start, s.stop),
                 len(nodes),
@@ -108,73 +110,33 @@ class Evidence:
             )
         return Lattice(nodes, grid.first * CELLS, CELLS)
 
-    def _status(
-        self,
-        occluded: OccludedPolicy,
-        origin: Float[np.ndarray, " 3"],
-        spacing: float,
-        shape: tuple[int, int, int],
-    ) -> UInt8[np.ndarray, "nx ny nz"]:
-        """What the views say of cells, and, where it decides, the posterior."""
-        place = self._map.plane, origin, spacing, shape
-        if self.below is None:
-            status = visibility.classify_cells(self.views, *place)
-        else:
-            status = visibility.classify_cells_around(self.views, self.below, *place)
-        if occluded == "posterior":
-            _trust_posterior(self._map, self._config, status, origin, spacing)
-        return status
-
-    def _marks_of_status(self, occluded: OccludedPolicy) -> UInt8[np.ndarray, " 4"]:
-        shadow = 0 if occluded == "free" else OCCLUDED
-        unseen = 0 if self._config.unobserved == "free" else UNOBSERVED
-        marks = np.zeros(4, dtype=np.uint8)
-        marks[kernels.OCCLUDED] = shadow
-        marks[kernels.PARTLY] = shadow or unseen
-        marks[kernels.UNOBSERVED] = unseen
-        return marks
-
-    def _seen(
-        self, grid: Grid, objects: Float32[np.ndarray, "nx ny nz"] | None, step: float
-    ) -> Iterator[Surface]:
+    def _seen(self, grid: Grid, objects: Nodes | None, step: float) -> Iterator[Surface]:
         """Marks, points and half the widths of what was seen, the less important first."""
-        yield BACKGROUND, *self._clutter
+        yield MARKED["background"], *self._clutter
         for k, points, half in self._surfaces:
             kept: Any = slice(None)
             if objects is not None:
                 kept = off_level_set(points, objects, grid)
-            yield BACKGROUND + k, points[kept], half[kept]
+            yield LAST_MARK + k, points[kept], half[kept]
         ids = (*self._map.object_ids, *self.without_depth)
         for view, cones in zip(self._map.views, self._cones, strict=True):
             for object_id, points, half in lost_points(view, cones, grid.origin, grid.upper, step):
-                yield BACKGROUND + 1 + ids.index(object_id), points, half
-
-
-def _cells_within(
-    inner: Grid, origin: Float[np.ndarray, " 3"], spacing: float, shape: tuple[int, int, int]
-) -> tuple[slice, slice, slice]:
-    """Cells that lie wholly inside another grid's box."""
-    low = np.clip(np.ceil((inner.origin - origin) / spacing - 1e-9), 0, shape).astype(int)
-    high = np.clip(np.floor((inner.upper - origin) / spacing + 1e-9), low, shape).astype(int)
-    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    return x, y, z
+                yield LAST_MARK + 1 + ids.index(object_id), points, half
 
 
 def _trust_posterior(
     map_: Any,
     config: WorldConfig,
     status: UInt8[np.ndarray, "nx ny nz"],
-    origin: Float[np.ndarray, " 3"],
+    origin: Vector,
     spacing: float,
 ) -> None:
-    """Call occluded cells free where the map has support: the posterior decides there.
-
-    Not behind unlabelled clutter: the map has no class for that.
-    """
+    """Call occluded cells free where the map has support: the posterior decides there. Not
+    behind unlabelled clutter: the map has no class for that."""
     lower, upper = (np.asarray(c) for c in map_.support_bounds())
     first = np.clip(np.floor((lower - origin) / spacing).astype(int), 0, status.shape)
     last = np.clip(np.ceil((upper - origin) / spacing).astype(int), first, status.shape)
-    hidden = status[tuple(slice(a, b) for a, b in zip(first, last, strict=True))]
+    hidden = status[window(first, last)]
     hidden = (hidden == kernels.OCCLUDED) | (hidden == kernels.PARTLY)
     if not hidden.any():
         return
@@ -183,7 +145,9 @@ def _trust_posterior(
         start = visibility.clutter_depth(view, map_.plane, config)
         if np.isfinite(start).any():
             plane = None if config.support == "seen" else map_.plane
-            hidden &= ~visibility.behind(view, start, plane, corner, spacing, size)
+            shadow = [visibility.shadow_behind(view, start)]
+            behind = visibility.classify_cells(shadow, plane, corner, spacing, size)
+            hidden &= (behind != kernels.OCCLUDED) & (behind != kernels.PARTLY)
     for x in range(size[0]):
         index = np.argwhere(hidden[x])
         if len(index) == 0:
@@ -195,11 +159,11 @@ def _trust_posterior(
         status[where] = np.where(whole, kernels.FREE, kernels.UNOBSERVED)
 
 
-def unmark(marks: Lattice, classes: Collection[int], inside: Lattice | None) -> Lattice:
+def unmark(marks: Lattice, classes: Collection[int], inside: Lattice | None = None) -> Lattice:
     """Return the marks less some objects' seen surfaces, and less occluded nodes inside their
     level set (`inside`, on a finer lattice)."""
     labels = marks.labels.copy()
-    labels[np.isin(labels, [BACKGROUND + k for k in classes])] = 0
+    labels[np.isin(labels, [LAST_MARK + k for k in classes])] = 0
     if inside is None:
         return Lattice(labels, marks.corner, CELLS)
     ratio = inside.factor // CELLS
@@ -209,8 +173,76 @@ def unmark(marks: Lattice, classes: Collection[int], inside: Lattice | None) -> 
     start = first - marks.corner
     low = np.maximum(start, 0)
     high = np.minimum(start + np.array(fine.shape), labels.shape)
-    window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    part = fine[tuple(slice(a, b) for a, b in zip(low - start, high - start, strict=True))]
-    target = labels[window]
-    target[(part != 0) & (target == OCCLUDED)] = 0
+    part, target = fine[window(low - start, high - start)], labels[window(low, high)]
+    target[(part != 0) & (target == MARKED["occluded"])] = 0
     return Lattice(labels, marks.corner, CELLS)
+
+
+def only(marks: Lattice, label: int) -> Lattice:
+    """Keep one label, and the whole of every obstacle cell that it has a corner of: no part of
+    an obstacle is lost between two names."""
+    own = marks.labels == label
+    if own.any():
+        box = bounding(own, 1)
+        near, marked = own[box], marks.labels[box] > 0
+        cell = np.ones(tuple(n - 1 for n in near.shape), dtype=bool)
+        touched = np.zeros_like(cell)
+        for corner in corners(near.shape):
+            cell &= marked[corner]
+            touched |= near[corner]
+        cell &= touched
+        for corner in corners(near.shape):
+            near[corner] |= cell
+    return Lattice(own.view(np.uint8), marks.corner, marks.factor)
+
+
+def rasterize_mesh(known: KnownMesh, grid: Grid, factor: int) -> Lattice:
+    """Mark every cell a mesh touches, and its inside if it is watertight.
+
+    The surface is divided until its edges are no longer than a cell; every point of a triangle is
+    then within edge / sqrt(3) of a corner, and the cells within that are marked.
+    """
+    import trimesh
+
+    spacing = grid.spacing / factor
+    lower, upper = known.box()
+    corner = np.floor(lower / spacing).astype(np.int64) - 2
+    last = np.ceil(upper / spacing).astype(np.int64) + 2
+    labels = lattice_nodes(last - corner + 1, f"known mesh {known.name!r}")
+    vertices = np.asarray(known.mesh.vertices, dtype=np.float64)
+    faces = np.asarray(known.mesh.faces)
+    fine, fine_faces = trimesh.remesh.subdivide_to_size(vertices, faces, spacing, max_iter=40)
+    samples = np.ascontiguousarray(fine[np.unique(fine_faces)], dtype=np.float64)
+    half = np.full(len(samples), spacing / math.sqrt(3.0))
+    kernels.mark_boxes(samples, half, spacing * corner, spacing, np.uint8(1), labels)
+    if known.mesh.is_watertight:
+        _fill_inside(labels, spacing * corner, spacing, vertices[faces])
+    return Lattice(labels, corner, factor)
+
+
+def _fill_inside(
+    labels: np.ndarray, origin: Vector, spacing: float, triangles: Float[np.ndarray, "f 3 3"]
+) -> None:
+    """Mark the unmarked regions that lie inside a closed surface, one test per region."""
+    regions, count = ndimage.label(labels == 0)
+    outside = regions[0, 0, 0]
+    first = ndimage.find_objects(regions)
+    for region in range(1, count + 1):
+        if region == outside:
+            continue
+        box = first[region - 1]
+        where = np.argwhere(regions[box] == region)[0] + [s.start for s in box]
+        if abs(winding_number(origin + spacing * where, triangles)) > 0.5:
+            labels[regions == region] = 1
+
+
+def winding_number(point: Vector, triangles: Float[np.ndarray, "f 3 3"]) -> float:
+    """How often a closed surface winds round a point: its solid angle over 4 pi. Van Oosterom and
+    Strackee, "The solid angle of a plane triangle" (1983), eq. 8."""
+    a, b, c = (triangles[:, i] - point for i in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    volume = np.einsum("ij,ij->i", a, np.cross(b, c))
+    dots = la * lb * lc
+    for (p, q), length in (((a, b), lc), ((b, c), la), ((c, a), lb)):
+        dots = dots + np.einsum("ij,ij->i", p, q) * length
+    return float(np.arctan2(volume, dots).sum() / (2.0 * math.pi))

@@ -7,10 +7,13 @@ import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
+from scipy import ndimage
 
+from vprism_plan._arguments import number, whole
 from vprism_plan.errors import ConfigError, WorldError
 from vprism_plan.world.config import check_level
+from vprism_plan.world.grid import Index, Points, Vector, corners, window
 
 if TYPE_CHECKING:
     import trimesh
@@ -26,9 +29,9 @@ def extract_meshes(
 ) -> "dict[int, trimesh.Trimesh]":
     """Closed surface of every object, world frame, metres.
 
-    Object k is {x : P(occupied) >= level and k is the most probable object}, so objects
-    do not overlap. Surfaces are watertight, with outward normals (positive volume). An
-    object that reaches the level nowhere on the grid is left out, with a warning.
+    Object k is {x : P(occupied) >= level and k is the most probable object}, so objects do not
+    overlap. Surfaces are watertight, with outward normals (positive volume). An object that reaches
+    the level nowhere on the grid is left out, with a warning.
 
     Args:
         map: a `VPrismMap`.
@@ -36,37 +39,25 @@ def extract_meshes(
         resolution: edge of the marching cubes, metres.
 
     Raises:
-        ConfigError: level or resolution is out of range.
         WorldError: a surface could not be closed.
     """
     probabilities, origin = _sample(map, level, resolution)
-    occupied = probabilities[..., 1:].sum(axis=-1) - level
     meshes = {}
     for k, object_id in enumerate(map.object_ids, start=1):
-        inside = occupied
-        if len(map.object_ids) > 1:
-            others = np.delete(probabilities, (0, k), axis=-1).max(axis=-1)
-            inside = np.minimum(occupied, probabilities[..., k] - others)
-        mesh = surface(inside, origin, resolution)
-        if mesh is None:
-            _log.warning(
-                "object %d has no surface at level %g on a grid of %g m: left out",
-                object_id,
-                level,
-                resolution,
-            )
-            continue
-        meshes[object_id] = mesh
+        mesh = surface(_inside(probabilities, k, level), origin, resolution)
+        if mesh is not None:
+            meshes[object_id] = mesh
+        else:
+            why = "object %d has no surface at level %g on a grid of %g m: left out"
+            _log.warning(why, object_id, level, resolution)
     return meshes
 
 
 def extract_union_mesh(
     map: Any, level: float = 0.5, resolution: float = 0.01
 ) -> "trimesh.Trimesh | None":
-    """Closed surface of all objects together, {x : P(occupied) >= level}; None if empty.
-
-    Arguments, guarantees and errors as for `extract_meshes`.
-    """
+    """Closed surface of all objects together, {x : P(occupied) >= level}; None if empty. Arguments,
+    guarantees and errors as for `extract_meshes`."""
     probabilities, origin = _sample(map, level, resolution)
     mesh = surface(probabilities[..., 1:].sum(axis=-1) - level, origin, resolution)
     if mesh is None:
@@ -76,7 +67,7 @@ def extract_union_mesh(
 
 def _sample(
     map_: Any, level: float, resolution: float
-) -> tuple[Float[np.ndarray, "nx ny nz k"], Float[np.ndarray, " 3"]]:
+) -> tuple[Float[np.ndarray, "nx ny nz k"], Vector]:
     """Class probabilities on a grid over the map's support, with an empty layer round it."""
     check_level(level)
     check_spacing(resolution, "resolution")
@@ -86,13 +77,11 @@ def _sample(
 
 
 def surface(
-    inside: Float[np.ndarray, "nx ny nz"], origin: Float[np.ndarray, " 3"], resolution: float
+    inside: Float[np.ndarray, "nx ny nz"], origin: Vector, resolution: float
 ) -> "trimesh.Trimesh | None":
-    """Surface {inside = 0} around {inside > 0}; None if there is none.
-
-    A vertex that nearly coincides with a node leaves triangles without area and, when
-    those are merged, holes: values this close to 0 are pushed away from it first.
-    """
+    """Surface {inside = 0} around {inside > 0}; None if there is none. A vertex that nearly
+    coincides with a node leaves triangles without area and, when those are merged, holes: values
+    this close to 0 are pushed away from it first."""
     import trimesh
     from skimage.measure import marching_cubes
 
@@ -113,7 +102,6 @@ def surface(
     )
 
 
-_CORNERS = tuple(itertools.product((0, 1), repeat=3))
 # Outside, for nodes that nobody has to evaluate.
 _NOTHING = -0.1
 
@@ -123,28 +111,18 @@ def extract_refined_meshes(
 ) -> "dict[int, trimesh.Trimesh]":
     """Closed surface of every object on the lattice of nodes spacing * integers, metres.
 
-    Objects are those of `extract_meshes`. A grid of spacing * 2^halvings is evaluated
-    wholly; cells in which the surface runs, and at first their neighbours, are halved
-    until they have the spacing. What is smaller than the first grid and touches none of
-    its nodes is not found. An object of which nothing is found is left out, with a warning.
-
-    Args:
-        map: a `VPrismMap`.
-        level: probability in (0, 1).
-        spacing: edge of the marching cubes, metres.
-        halvings: how often cells are halved; None takes the coarsest first grid that is
-            no wider than half a kernel length.
-
-    Raises:
-        ConfigError: level, spacing or halvings is out of range.
-        WorldError: a surface could not be closed.
+    Objects are those of `extract_meshes`. A grid of spacing * 2^halvings is evaluated wholly; cells
+    in which the surface runs, and at first their neighbours, are halved until they have the
+    spacing. What is smaller than the first grid and touches none of its nodes is not found. An
+    object of which nothing is found is left out, with a warning. `halvings` may be up to 8; None
+    takes the coarsest first grid that is no wider than half a kernel length. WorldError if one
+    could not be closed.
     """
     check_level(level)
     check_spacing(spacing, "spacing")
     if halvings is None:
         halvings = max(0, math.floor(math.log2(0.5 * map.kernel_length / spacing)))
-    if not 0 <= halvings <= 8:
-        raise ConfigError(f"halvings is {halvings}; it must be between 0 and 8")
+    whole("halvings", halvings, 0, 8)
     lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map.support_bounds())
     probabilities, first = sample_box(map, lower, upper, spacing * 2**halvings, "spacing")
     meshes = {}
@@ -175,14 +153,13 @@ def _inside(
 
 
 def _cropped(
-    values: Float[np.ndarray, "nx ny nz"], first: Int[np.ndarray, " 3"]
-) -> tuple[Float[np.ndarray, "mx my mz"], Int[np.ndarray, " 3"]]:
+    values: Float[np.ndarray, "nx ny nz"], first: Index
+) -> tuple[Float[np.ndarray, "mx my mz"], Index]:
     """Keep three cells of room around the object: halving may move its surface by two."""
     hits = np.argwhere(values > 0)
     low = np.maximum(hits.min(axis=0) - 3, 0)
     high = np.minimum(hits.max(axis=0) + 4, values.shape)
-    window = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    return values[window].copy(), first + low
+    return values[window(low, high)].copy(), first + low
 
 
 def _halved(
@@ -190,16 +167,13 @@ def _halved(
     k: int,
     level: float,
     values: Float[np.ndarray, "nx ny nz"],
-    corner: Int[np.ndarray, " 3"],
+    corner: Index,
     halvings: int,
     spacing: float,
     wide: bool,
-) -> tuple[Float[np.ndarray, "mx my mz"], Int[np.ndarray, " 3"]]:
-    """Values on nodes half as far apart, evaluated where the surface may run.
-
-    `halvings` still to come, this one included; `corner` in steps of the given grid; if
-    `wide`, the cells around those in which the surface runs are evaluated, too.
-    """
+) -> tuple[Float[np.ndarray, "mx my mz"], Index]:
+    """Values on nodes half as far apart, evaluated where the surface may run, if `wide` in the
+    cells around as well; `halvings` still to come, `corner` in steps of the given grid."""
     check_size(2 * np.array(values.shape), spacing, "spacing")
     mixed = _mixed(values, wide)
     fine = _between(values)
@@ -220,12 +194,8 @@ def _halved(
 
 def _mixed(values: Float[np.ndarray, "nx ny nz"], wide: bool) -> Bool[np.ndarray, "cx cy cz"]:
     """Cells with corners on both sides; if `wide`, the cells around them, too."""
-    from scipy import ndimage
-
     positive = values > 0
-    shape = tuple(n - 1 for n in values.shape)
-    views = [positive[tuple(slice(c, c + n) for c, n in zip(o, shape, strict=True))]
-             for o in _CORNERS]  # fmt: skip
+    views = [positive[corner] for corner in corners(values.shape)]
     some, every = np.logical_or.reduce(views), np.logical_and.reduce(views)
     mixed = some & ~every
     if wide:
@@ -250,8 +220,7 @@ _MAX_NODES = 60_000_000
 
 def check_spacing(spacing: float, name: str) -> None:
     """Raise ConfigError, calling it by its name, unless nodes can be so many metres apart."""
-    if not 1e-4 <= spacing <= 1.0:
-        raise ConfigError(f"{name} is {spacing}; it must be between 0.0001 and 1 metres")
+    number(name, spacing, 1e-4, 1.0, "metres")
 
 
 def check_size(shape: Any, spacing: float, name: str, most: int = _MAX_NODES) -> None:
@@ -263,7 +232,7 @@ def check_size(shape: Any, spacing: float, name: str, most: int = _MAX_NODES) ->
         )
 
 
-def predicted(source: Any, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n k"]:
+def predicted(source: Any, points: Points) -> Float32[np.ndarray, "n k"]:
     """Return `source.predict_proba` at points (metres), asked for piece by piece."""
     out = np.empty((len(points), len(source.object_ids) + 1), dtype=np.float32)
     for start in range(0, len(points), _CHUNK):
@@ -273,27 +242,14 @@ def predicted(source: Any, points: Float[np.ndarray, "n 3"]) -> Float32[np.ndarr
 
 
 def sample_box(
-    source: Any,
-    lower: Float[np.ndarray, " 3"],
-    upper: Float[np.ndarray, " 3"],
-    spacing: float,
-    name: str,
-    most: int = _MAX_NODES,
-) -> tuple[Float32[np.ndarray, "nx ny nz k"], Int[np.ndarray, " 3"]]:
-    """Return class probabilities over a box and a layer around it in which all is empty.
-
-    Args:
-        source: a `VPrismMap`, or what else has `object_ids` and `predict_proba`.
-        lower, upper: corners, metres.
-        spacing: of the nodes, which are whole multiples of it, metres.
-        name: what the user calls the spacing.
-        most: nodes.
-
-    Returns:
-        The probabilities, and the first node in steps.
+    source: Any, lower: Vector, upper: Vector, spacing: float, name: str, most: int = _MAX_NODES
+) -> tuple[Float32[np.ndarray, "nx ny nz k"], Index]:
+    """Return class probabilities over a box (corners, metres) and a layer around it in which all is
+    empty, at whole multiples of the spacing (metres; `name` is what the user calls it), and the
+    first node in steps. `source` has `object_ids` and `predict_proba`.
 
     Raises:
-        ConfigError: too many nodes.
+        ConfigError: more than `most` nodes.
     """
     first = np.floor(lower / spacing).astype(np.int64) - 1
     shape = np.ceil(upper / spacing).astype(np.int64) + 2 - first

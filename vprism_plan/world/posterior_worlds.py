@@ -8,17 +8,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, UInt8
+from jaxtyping import Bool, Int, Int32, UInt8
+from scipy import ndimage
+from scipy.special import ndtr
 
+from vprism_plan._arguments import number, whole
 from vprism_plan._kernels import risk as kernels
+from vprism_plan._kernels.risk import BLOCK
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
-from vprism_plan.world._draws import Owners, judge
 from vprism_plan.world.distance import checked_points
+from vprism_plan.world.grid import Chosen, Index, Points, Shape3, Slices, Values, window
 
 _MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
 _FINEST = 16.0  # stored steps per voxel, at most
-_B = kernels.BLOCK
+_MAX_VOXELS = 40_000_000
+_GEMM_ROWS = 1024  # points per matrix product: their logits stay in the cache
 
 
 @dataclass(frozen=True)
@@ -33,35 +38,37 @@ class Tables:
 class PosteriorWorlds:
     """S joint draws of a map's weights: S worlds that the camera's view does not tell apart.
 
-    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1/2 at its centre x,
-    the level of the mesh, and belongs to the object of the largest logit. The same draw
-    holds everywhere, so what hides in one place is correlated with what hides next to it.
+    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1/2 at its centre x, the level
+    of the mesh, and belongs to the object of the largest logit. The same draw holds everywhere, so
+    what hides in one place is correlated with what hides next to it.
 
-    Per voxel and draw one byte holds the distance to the nearest occupied voxel centre,
-    rounded down. A ball is compared with it at the nodes of the cell around its centre; what
-    they leave open is looked up voxel by voxel. An occupied voxel counts as the ball
-    inscribed in it: a draw is touched if the centre of a voxel it occupies is within
-    radius + resolution / 2 of a ball's centre.
+    Per voxel and draw one byte holds the distance to the nearest occupied voxel centre, rounded
+    down, and is compared with a ball at the nodes of the cell around its centre; what they leave
+    open is looked up voxel by voxel. An occupied voxel counts as the ball inscribed in it: a draw
+    is touched if the centre of one is within radius + resolution / 2 of a ball's centre.
 
-    Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when
-    the first ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the
-    map's support grown by `reach`, S bytes per drawn voxel and S bytes per baked voxel
-    within `reach` of anything that any draw may occupy.
+    Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when the first
+    ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the map's support grown by
+    `reach`, S bytes per drawn voxel and S bytes per baked voxel within `reach` of anything that any
+    draw may occupy.
 
     Args:
         map: a `VPrismMap`.
         n_worlds: number of draws S, a multiple of 64.
         seed: of the draws; the same seed, the same worlds.
         resolution: edge of a voxel, metres; centres are whole multiples of it.
-        reach: distances up to this are known, metres: two and a half voxels more than the
-            largest ball that will be asked about. At most 31 voxels.
-        tolerance: how probable it may be that skipping the draws of nearly certain voxels
-            changes any answer (see `error_free`, `error_occupied`).
+        reach: distances up to this are known, metres: two and a half voxels more than the largest
+            ball that will be asked about. At most 31 voxels.
+        tolerance: how probable it may be that skipping the draws of nearly certain voxels changes
+            any answer.
 
     Attributes:
-        error_free: bound on the probability that a draw differs in a voxel that was called
-            free without drawing: how much a probability of collision may be too low.
+        error_free: bound on the probability that a draw differs in a voxel that was called free
+            without drawing: how much a probability of collision may be too low.
         error_occupied: the same for voxels called occupied: how much it may be too high.
+        first: index of the first voxel of the tables.
+        tables: everything baked so far.
+        scale: stored steps per voxel, and the reach in voxels.
 
     Raises:
         WorldError: a value outside its range; the map's support is too large.
@@ -76,17 +83,15 @@ class PosteriorWorlds:
         reach: float = 0.2,
         tolerance: float = 1e-3,
     ) -> None:
-        if n_worlds < 64 or n_worlds % 64:
-            raise WorldError(f"n_worlds is {n_worlds}; it must be a positive multiple of 64")
-        if not (np.isfinite(resolution) and resolution > 0.0):
-            raise WorldError(f"resolution is {resolution}; it must be a positive length in metres")
+        if whole("n_worlds", n_worlds, 64, error=WorldError) % 64:
+            raise WorldError(f"n_worlds is {n_worlds}; it must be a multiple of 64")
+        number("resolution", resolution, 0.0, unit="metres", above=True, error=WorldError)
         if not 2.0 <= reach / resolution <= _MAX_REACH:
             raise WorldError(
                 f"reach is {reach} m, {reach / resolution:.1f} voxels of {resolution} m; it must "
                 f"be 2 to {_MAX_REACH} voxels: use a coarser resolution for larger balls"
             )
-        if not 0.0 <= tolerance <= 0.1:
-            raise WorldError(f"tolerance is {tolerance}; it must be a probability up to 0.1")
+        number("tolerance", tolerance, 0.0, 0.1, error=WorldError)
         self.map = map
         self.n_worlds = n_worlds
         self.seed = seed
@@ -99,18 +104,14 @@ class PosteriorWorlds:
 
         self._reach = reach / self.resolution  # voxels
         self._whole = int(self._reach)
-        self._scale = min(_FINEST, 254.0 / self._reach)
+        self.scale = min(_FINEST, 254.0 / self._reach), self._reach
         squares = np.arange(3 * self._whole**2 + 2, dtype=np.float64)
-        self._lut = np.floor(self._scale * np.sqrt(squares)).clip(max=254).astype(np.uint8)
+        self._lut = np.floor(self.scale[0] * np.sqrt(squares)).clip(max=254).astype(np.uint8)
         self._lut[squares > self._reach**2] = kernels.NOTHING
         self._grown = self._grow()
-        self._first_table = self._owners.first - self._whole
+        self.first = self._owners.first - self._whole
         self._rules: list[frozenset[int]] = [frozenset()]
-        self._tables = Tables(
-            self._grown[None].copy(),
-            np.empty((0, n_worlds), np.uint8),
-            np.empty(0, np.uint8),
-        )
+        self.tables = self._nothing_baked()
         self._lock = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -131,43 +132,32 @@ class PosteriorWorlds:
         )
 
     def redrawn(self, seed: int) -> "PosteriorWorlds":
-        """Return as many other worlds of the same map, with nothing baked yet.
-
-        Shares what does not depend on the draws. A path that was chosen because few of these
-        worlds object to it is judged fairly only by worlds that had no say in the choice.
-        """
+        """Return as many other worlds of the same map, with nothing baked yet: a path that was
+        chosen because few of these object to it is judged fairly only by worlds that had no say
+        in the choice."""
         other = copy.copy(self)
         other.seed = seed
         other._owners = self._owners.redrawn(seed)
         with self._lock:
             other._rules = list(self._rules)
-        other._tables = Tables(
-            np.repeat(self._grown[None], len(other._rules), axis=0),
-            np.empty((0, self.n_worlds), np.uint8),
-            np.empty(0, np.uint8),
-        )
+        other.tables = other._nothing_baked()
         return other
+
+    def _nothing_baked(self) -> Tables:
+        rows = np.repeat(self._grown[None], len(self._rules), axis=0)
+        return Tables(rows, np.empty((0, self.n_worlds), np.uint8), np.empty(0, np.uint8))
 
     def sample(self) -> None:
         """Draw the weights and bake a first block now, seconds that the first question saves."""
         with self._lock:
             self._owners.sample()
         needed = np.argwhere(self._grown == kernels.UNBAKED)
-        self._bake(0, needed[:1] // _B)
+        self._bake(0, needed[:1] // BLOCK)
 
-    # --- what is where ---------------------------------------------------------------
     def owners(self, index: Int[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n s"]:
-        """Return which object occupies each voxel in each draw.
-
-        Args:
-            index: (n, 3) voxel indices: centres are `resolution * index`, metres.
-
-        Returns:
-            (n, S): 0 free, k the object `map.object_ids[k - 1]`.
-
-        Raises:
-            WorldError: index is not (n, 3) integers.
-        """
+        """Return which object occupies each voxel (centres are `resolution * index`, metres) in
+        each draw: 0 free, k the object `map.object_ids[k - 1]`; WorldError if index is not (n, 3)
+        integers."""
         index = np.asarray(index)
         if index.ndim != 2 or index.shape[1] != 3 or not np.issubdtype(index.dtype, np.integer):
             raise WorldError(
@@ -182,20 +172,14 @@ class PosteriorWorlds:
         return out
 
     def touched(
-        self,
-        centers: Float[np.ndarray, "n 3"],
-        radii: Any,
-        without: Collection[int] = (),
+        self, centers: Points, radii: Any, without: Collection[int] = ()
     ) -> Bool[np.ndarray, "n s"]:
-        """Return in which draws each ball touches an occupied voxel.
+        """Return in which draws each ball (centres in the world, one radius or each its own,
+        metres) touches an occupied voxel; objects `without` may be touched. Never misses a voxel
+        centre inside a ball.
 
-        Never misses a voxel centre inside a ball. The probability that a body swept along
-        a path touches anything is `touched(...).any(axis=0).mean()`.
-
-        Args:
-            centers: (n, 3) world coordinates, metres.
-            radii: of all balls, or of each (n,), metres.
-            without: ids of objects that may be touched.
+        The probability that a body swept along a path touches anything is
+        `touched(...).any(axis=0).mean()`.
 
         Raises:
             WorldError: not finite, a radius that `reach` does not cover, an unknown object.
@@ -206,63 +190,41 @@ class PosteriorWorlds:
         rule = self.rule(without)
         out = np.empty((len(centers), self.n_worlds), np.bool_)
         while True:
-            tables = self._tables
             wanted = self.new_marks()
-            missing = kernels.touch_each(
-                centers, radii, rule, tables.distance_row, tables.rows, tables.lowest,
-                self.first, self.resolution, self._scale, self._reach, out, wanted,
-            )  # fmt: skip
+            missing = kernels.touch_each(centers, radii, rule, *self.baked(), out, wanted)
             if not missing:
                 return out
             self.bake_marked(wanted)
 
     def bake(self, lower: Any = None, upper: Any = None, without: Collection[int] = ()) -> None:
         """Draw and bake every block that a box (corners, world, metres) meets; None is all."""
-        rule = self.rule(without)
         shape = np.array(self._blocks_of_table())
-        corners = []
-        for corner, default in ((lower, 0), (upper, None)):
-            if corner is None:
-                corners.append(np.zeros(3, int) if default == 0 else shape)
-            else:
-                point = checked_points(np.reshape(np.asarray(corner, dtype=np.float64), (1, -1)))[0]
-                step = np.floor((point / self.resolution - self.first + 0.5) / _B).astype(int)
-                corners.append(np.clip(step + (default is None), 0, shape))
-        sizes = np.maximum(corners[1] - corners[0], 0)
-        blocks = np.moveaxis(np.indices(tuple(sizes)), 0, -1).reshape(-1, 3) + corners[0]
-        table = self._tables.distance_row[rule]
-        open_blocks = [
-            block for block in blocks if (table[_block_slices(block)] == kernels.UNBAKED).any()
-        ]
-        self._bake(rule, np.array(open_blocks, dtype=np.int64).reshape(-1, 3))
+        low = np.zeros(3, int) if lower is None else self._block_at(lower)
+        high = shape if upper is None else self._block_at(upper) + 1
+        low, high = np.clip(low, 0, shape), np.clip(high, 0, shape)
+        blocks = np.moveaxis(np.indices(tuple(np.maximum(high - low, 0))), 0, -1).reshape(-1, 3)
+        self._bake(self.rule(without), blocks + low)
+
+    def _block_at(self, corner: Any) -> Index:
+        point = checked_points(np.reshape(np.asarray(corner, dtype=np.float64), (1, -1)))[0]
+        return np.floor((point / self.resolution - self.first + 0.5) / BLOCK).astype(int)
 
     @property
     def nbytes(self) -> int:
         """Bytes held now, by voxel indices, owners and distances."""
-        tables = self._tables
-        parts = (self._owners, self._grown, tables.distance_row, tables.rows)
+        parts = self._owners, self._grown, self.tables.distance_row, self.tables.rows
         return sum(int(p.nbytes) for p in parts)
-
-    # --- for the risk of robots ----------------------------------------------------------
-    @property
-    def first(self) -> Int[np.ndarray, " 3"]:
-        """Index of the tables' first voxel."""
-        return self._first_table
-
-    @property
-    def tables(self) -> Tables:
-        """Everything baked so far."""
-        return self._tables
 
     @property
     def owner_tables(self) -> tuple[Any, Any, Any]:
         """Rows of the owners per voxel, the owners (S innermost), and the first voxel."""
         return self._owners.row, self._owners.table, self._owners.first
 
-    @property
-    def scale(self) -> tuple[float, float]:
-        """Stored steps per voxel, and the reach in voxels."""
-        return self._scale, self._reach
+    def baked(self) -> tuple[Any, ...]:
+        """What the kernels read: one snapshot of the tables, where they begin, and the scale."""
+        now = self.tables
+        parts = now.distance_row, now.rows, now.lowest, self.first, self.resolution
+        return (*parts, *self.scale)
 
     def new_marks(self) -> Bool[np.ndarray, "g bx by bz"]:
         """Return unset marks for blocks that have to be baked, per rule."""
@@ -275,21 +237,13 @@ class PosteriorWorlds:
                 self._bake(rule, np.argwhere(wanted[rule]))
 
     def rule(self, without: Collection[int]) -> int:
-        """Return the index of the table that leaves out some objects; makes it if needed.
-
-        Raises:
-            WorldError: the map has no such object.
-        """
-        valid = list(self.map.object_ids)
-        unknown = sorted(set(without) - set(valid))
-        if unknown:
-            raise WorldError(f"no object {unknown[0]} in the map; it has {valid}")
-        gone = frozenset(valid.index(i) + 1 for i in without)
+        """Return the index of the table that leaves out some objects; makes it if needed."""
+        gone = frozenset(classes_of(self.map, without))
         with self._lock:
             if gone not in self._rules:
-                old = self._tables
+                old = self.tables
                 rows = np.concatenate([old.distance_row, self._grown[None]])
-                self._tables = Tables(rows, old.rows, old.lowest)
+                self.tables = Tables(rows, old.rows, old.lowest)
                 self._rules = [*self._rules, gone]
             return self._rules.index(gone)
 
@@ -312,11 +266,8 @@ class PosteriorWorlds:
                 f"with reach of at least {largest + 2.5 * self.resolution:.3f} m"
             )
 
-    # --- drawing and baking ----------------------------------------------------------
     def _grow(self) -> Int32[np.ndarray, "ex ey ez"]:
         """Mark the voxels within reach of any that a draw may occupy: they need a row."""
-        from scipy import ndimage
-
         possible = np.pad(self._owners.row >= 0, self._whole)
         grown = np.full(possible.shape, kernels.FREE, np.int32)
         if possible.any():
@@ -324,56 +275,244 @@ class PosteriorWorlds:
             grown[near] = kernels.UNBAKED
         return grown
 
-    def _blocks_of_table(self) -> tuple[int, int, int]:
-        x, y, z = (-(-n // _B) for n in self._grown.shape)
+    def _blocks_of_table(self) -> Shape3:
+        x, y, z = (-(-n // BLOCK) for n in self._grown.shape)
         return x, y, z
 
     def _bake(self, rule: int, blocks: Int[np.ndarray, "b 3"]) -> None:
         """Fill the distances of some blocks of the table (block coordinates)."""
         with self._lock:
-            old = self._tables
+            old = self.tables
             table = old.distance_row[rule]
-            todo, wanted, start = [], [], len(old.rows)
+            todo, wanted, count = [], [], 0
             for block in blocks:
-                window = table[_block_slices(block)]
-                where = np.nonzero(window == kernels.UNBAKED)
+                where = np.nonzero(table[_block_slices(block)] == kernels.UNBAKED)
                 if len(where[0]) == 0:
                     continue
-                rows = np.full((_B, _B, _B), -1, np.int64)
-                rows[where] = start + np.arange(len(where[0]))
-                start += len(where[0])
+                rows = np.full((BLOCK, BLOCK, BLOCK), -1, np.int64)
+                rows[where] = count + np.arange(len(where[0]))
+                count += len(where[0])
                 todo.append(block)
                 wanted.append(rows)
             if not todo:
                 return
-            corners = np.array(todo) * _B - self._whole  # in voxels of the owners
-            reached = corners - self._whole, corners + _B - 1 + self._whole
+            corners = np.array(todo) * BLOCK - self._whole  # in voxels of the owners
+            reached = corners - self._whole, corners + BLOCK - 1 + self._whole
             self._owners.draw(self._owners.blocks_within(*reached))
-            fresh = np.empty((start - len(old.rows), self.n_worlds), np.uint8)
+            fresh = np.empty((count, self.n_worlds), np.uint8)
             counts = self.counting()[rule]
 
             def work(piece: slice) -> None:
-                for n in range(piece.start, piece.stop):
-                    cx, cy, cz = (int(c) for c in todo[n] * _B - self._whole)
-                    shifted = np.where(wanted[n] >= 0, wanted[n] - len(old.rows), -1)
+                for corner, rows in zip(corners[piece].tolist(), wanted[piece], strict=True):
                     kernels.bake_block(
-                        self._owners.row, self._owners.table, counts, cx, cy, cz,
-                        self._whole, self._lut, shifted, fresh,
+                        self._owners.row, self._owners.table, counts, *corner,
+                        self._whole, self._lut, rows, fresh,
                     )  # fmt: skip
 
             run_chunked(work, len(todo), 1)
             updated = old.distance_row.copy()
             for block, rows in zip(todo, wanted, strict=True):
-                window = updated[rule][_block_slices(block)]
-                part = rows[: window.shape[0], : window.shape[1], : window.shape[2]]
-                np.copyto(window, part.astype(np.int32), where=part >= 0)
-            self._tables = Tables(
-                updated,
-                np.concatenate([old.rows, fresh]),
-                np.concatenate([old.lowest, fresh.min(axis=1)]),
-            )
+                target = updated[rule][_block_slices(block)]
+                part = rows[tuple(slice(n) for n in target.shape)]
+                target[part >= 0] = part[part >= 0] + len(old.rows)
+            grown, lowest = [old.rows, fresh], [old.lowest, fresh.min(axis=1)]
+            self.tables = Tables(updated, np.concatenate(grown), np.concatenate(lowest))
 
 
-def _block_slices(block: Int[np.ndarray, " 3"]) -> tuple[slice, slice, slice]:
-    x, y, z = (slice(int(b) * _B, (int(b) + 1) * _B) for b in block)
-    return x, y, z
+def _block_slices(block: Index) -> Slices:
+    return window(BLOCK * block, BLOCK * (block + 1))
+
+
+def classes_of(map_: Any, object_ids: Collection[int]) -> list[int]:
+    """Return the classes 1, 2, ... of some objects of a map; WorldError if it lacks one."""
+    valid = list(map_.object_ids)
+    unknown = sorted(set(object_ids) - set(valid))
+    if unknown:
+        raise WorldError(f"no object {unknown[0]} in the map; it has {valid}")
+    return [valid.index(i) + 1 for i in object_ids]
+
+
+@dataclass(frozen=True, eq=False)
+class Verdicts:
+    """What every draw is taken to say of each voxel before any is drawn, as `Owners` keeps it;
+    bounds on the probability that a draw differs in any voxel called free, or occupied."""
+
+    first: Index
+    row: Int32[np.ndarray, "nx ny nz"]
+    voxels: Int[np.ndarray, "n 3"]
+    error_free: float
+    error_occupied: float
+
+
+def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
+    """Find the voxels whose draws are certain, so that nobody has to draw them.
+
+    With Gaussian logits z of mean m and variance v, and C objects, a draw occupies a voxel only if
+    some z_k - z_0 > -ln C: by the union bound its probability is at most sum_k Phi(-(m_0 - m_k - ln
+    C) / sqrt(v_0 + v_k)). It does not give the voxel to class k only if z_k < z_0 or z_k < z_j for
+    another object j: a sum of the same form. The voxels with the smallest bounds are skipped, as
+    many as sum up to half the tolerance each way: that bounds the error of the probability of any
+    event, a path's collision included.
+    """
+    lower, upper = (np.asarray(corner) for corner in map_.support_bounds())
+    n_objects = len(map_.object_ids)
+    if n_objects == 0 or not np.isfinite(lower).all() or not (lower < upper).all():
+        nothing = np.full((1, 1, 1), -1, np.int32)
+        return Verdicts(np.zeros(3, np.int64), nothing, np.zeros((0, 3), np.int64), 0.0, 0.0)
+    first = np.ceil(lower / resolution).astype(np.int64)
+    shape = np.floor(upper / resolution).astype(np.int64) - first + 1
+    if np.prod(shape, dtype=np.float64) > _MAX_VOXELS:
+        raise WorldError(
+            f"the map's support spans {' x '.join(map(str, shape))} voxels of {resolution} m "
+            f"(at most {_MAX_VOXELS:,}); use a coarser resolution"
+        )
+    occupied, lost, owner = _tails(map_, first, shape, resolution)
+    free = _skippable(occupied, 0.5 * tolerance)
+    certain = _skippable(lost, 0.5 * tolerance) & ~free
+    row = np.full(len(free), -1, np.int32)
+    row[certain] = owner[certain] - 1
+    drawn = np.flatnonzero(~free & ~certain)
+    row[drawn] = n_objects + np.arange(len(drawn), dtype=np.int32)
+    voxels = np.column_stack(np.unravel_index(drawn, tuple(shape)))
+    errors = float(occupied[free].sum()), float(lost[certain].sum())
+    return Verdicts(first, row.reshape(tuple(shape)), voxels.astype(np.int64), *errors)
+
+
+def _tails(
+    map_: Any, first: Index, shape: Index, resolution: float
+) -> tuple[Values, Values, UInt8[np.ndarray, " n"]]:
+    """Bounds on P(occupied) and P(not the likeliest object's) of each voxel, and that object."""
+    n = int(np.prod(shape))
+    occupied, lost, owner = np.empty(n), np.empty(n), np.empty(n, np.uint8)
+    n_objects = len(map_.object_ids)
+    slab = int(shape[1] * shape[2])
+    step = max(1, 200_000 // slab)
+    for start in range(0, int(shape[0]), step):
+        stop = min(start + step, int(shape[0]))
+        index = np.moveaxis(np.indices((stop - start, int(shape[1]), int(shape[2]))), 0, -1)
+        points = resolution * (index.reshape(-1, 3) + first + [start, 0, 0])
+        mean, variance = map_.logit_moments(points)
+        piece, rows = slice(start * slab, stop * slab), np.arange(len(points))
+        gap = mean[:, 1:] - mean[:, :1]
+        spread = np.sqrt(variance[:, 1:] + variance[:, :1])
+        occupied[piece] = ndtr((gap + np.log(n_objects)) / spread).sum(axis=1)
+        best = gap.argmax(axis=1)
+        apart = np.sqrt(variance[rows, 1 + best, None] + variance[:, 1:])
+        others = ndtr((gap - gap[rows, best, None]) / apart)
+        others[rows, best] = 0.0
+        lost[piece] = ndtr(-gap[rows, best] / spread[rows, best]) + others.sum(axis=1)
+        owner[piece] = best + 1
+    return occupied, lost, owner
+
+
+def _skippable(bound: Values, budget: float) -> Chosen:
+    """Mark the entries with the smallest bounds, as many as sum up to at most the budget."""
+    order = np.argsort(bound, kind="stable")
+    count = int(np.searchsorted(np.cumsum(bound[order]), budget, side="right"))
+    skip = np.zeros(len(bound), np.bool_)
+    skip[order[:count]] = True
+    return skip
+
+
+class Owners:
+    """Owners of the voxels of a map's support in S draws. One thread at a time may `draw`.
+
+    Attributes:
+        first: index of voxel (0, 0, 0): the centre of voxel i is resolution * (first + i).
+        row: (nx, ny, nz) int32: -1 free in every draw, else a row of `table`.
+        voxels: (n, 3) those that have to be drawn, in the order of their rows.
+        table: (r, S) uint8: one row per object, then one per voxel: 0 free, k the object
+            `map.object_ids[k - 1]`; not filled before its block is drawn.
+    """
+
+    def __init__(
+        self, map_: Any, n_worlds: int, seed: int, resolution: float, verdicts: Verdicts
+    ) -> None:
+        self.first, self.row, self.voxels = verdicts.first, verdicts.row, verdicts.voxels
+        self._map, self._n_worlds, self._resolution = map_, n_worlds, resolution
+        self._seed = seed
+        self._weights: np.ndarray | None = None
+        n_objects = len(map_.object_ids)
+        self.table = np.empty((n_objects + len(self.voxels), n_worlds), np.uint8)
+        self.table[:n_objects] = np.arange(1, n_objects + 1, dtype=np.uint8)[:, None]
+        self._shape = tuple(-(-n // BLOCK) for n in self.row.shape)
+        key = self.block_of(self.voxels)
+        self._by_block = np.argsort(key, kind="stable").astype(np.int64)
+        starts = np.arange(int(np.prod(self._shape)) + 1)
+        self._block_start = np.searchsorted(key[self._by_block], starts).astype(np.int64)
+        self._drawn = np.diff(self._block_start) == 0
+
+    def redrawn(self, seed: int) -> "Owners":
+        """Return the owners in as many other draws, none of them drawn yet."""
+        other = copy.copy(self)
+        other._seed, other._weights = seed, None
+        other.table = self.table.copy()
+        other._drawn = np.diff(self._block_start) == 0
+        return other
+
+    def snapshot(self) -> "Owners":
+        """Return the same with tables of their own, which `draw` here does not change."""
+        other = copy.copy(self)
+        other.table, other._drawn = self.table.copy(), self._drawn.copy()
+        return other
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return sum(int(p.nbytes) for p in (self.row, self.table, self.voxels, self._by_block))
+
+    def rows_of(self, local: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+        """Return the row of `table` of each voxel, -1 for free ones and outside the support."""
+        inside = ((local >= 0) & (local < self.row.shape)).all(axis=1)
+        rows = np.full(len(local), -1, np.int64)
+        rows[inside] = self.row[tuple(local[inside].T)]
+        return rows
+
+    def block_of(self, local: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+        """Return the flat index of the block that holds each voxel."""
+        return np.ravel_multi_index(tuple((local // BLOCK).T), self._shape).astype(np.int64)
+
+    def blocks_within(
+        self, low: Int[np.ndarray, "b 3"], high: Int[np.ndarray, "b 3"]
+    ) -> Int[np.ndarray, " n"]:
+        """Return the blocks that boxes of voxels, the upper corners included, meet."""
+        shape = np.array(self._shape)
+        near = np.zeros(self._shape, np.bool_)
+        for first, last in zip(low // BLOCK, high // BLOCK + 1, strict=True):
+            corners = np.clip(first, 0, shape), np.clip(last, 0, shape)
+            near[tuple(slice(a, b) for a, b in zip(*corners, strict=True))] = True
+        return np.flatnonzero(near).astype(np.int64)
+
+    def sample(self) -> np.ndarray:
+        """Return the drawn weights (features, S x K), made when first asked for: seconds for a
+        large map. Features first, so that a product over the hinges near a block reads whole
+        rows."""
+        if self._weights is None:
+            weights = self._map.sample_weights(self._n_worlds, self._seed)
+            self._weights = np.moveaxis(weights, 0, 1).reshape(weights.shape[1], -1)
+        return self._weights
+
+    def draw(self, blocks: Int[np.ndarray, " b"]) -> None:
+        """Fill the rows of all voxels of some blocks."""
+        first_row = len(self._map.object_ids)
+        for block in blocks[~self._drawn[blocks]]:
+            piece = slice(int(self._block_start[block]), int(self._block_start[block + 1]))
+            members = self._by_block[piece]
+            points = self._resolution * (self.voxels[members] + self.first)
+            found = np.empty((len(members), self._n_worlds), np.uint8)
+            for start in range(0, len(points), _GEMM_ROWS):
+                rows = slice(start, start + _GEMM_ROWS)
+                self._classify(points[rows], found[rows])
+            self.table[first_row + members] = found
+            self._drawn[block] = True
+
+    def _classify(self, points: Points, out: UInt8[np.ndarray, "n s"]) -> None:
+        """Fill in the class that occupies each point (m) in each draw; 0 is none. O(points x hinges
+        near any x S x K): points should be near each other."""
+        space, weights = self._map.space, self.sample()
+        low, high = points.min(axis=0) - space.radius, points.max(axis=0) + space.radius
+        near = np.flatnonzero(((space.hinges > low) & (space.hinges < high)).all(axis=1))
+        away = ((points[:, None] - space.hinges[near]) ** 2).sum(axis=2)
+        phi = np.where(away <= space.radius**2, np.exp(-space.gamma * away), 0.0)
+        logits = phi @ weights[near] + weights[-1]
+        kernels.classify(logits, self._n_worlds, weights.shape[1] // self._n_worlds, out)

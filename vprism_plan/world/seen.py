@@ -4,59 +4,49 @@
 With a return: a point of the object's surface. A thin part can stay below the level set: the
 kernels of the map are centimetres long, and the free space on both sides outweighs it.
 
-Without a return (glass, black, shiny things): somewhere along the ray the object's surface is,
-no nearer than its neighbours and its foot on the support surface allow, and no farther than that
+Without a return (glass, black, shiny things): somewhere along the ray the object's surface is, no
+nearer than its neighbours and its foot on the support surface allow, and no farther than that
 surface.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
-from vprism_plan._kernels import world as kernels
-from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception import Observation, Plane
-from vprism_plan.perception.camera import height_sigma, pixel_rays
-from vprism_plan.world.grid import Grid
+from vprism_plan.perception.camera import height_sigma, inlier_band, pixel_rays
+from vprism_plan.perception.plane import TableRegion, table_region
+from vprism_plan.world.distance import bounding, lower_bounds
+from vprism_plan.world.grid import Chosen, Grid, Image, Mask, Nodes, Points, Values, Vector
 from vprism_plan.world.visibility import THIN, beside
 
 _STRAY_SHARE = 0.03  # as in the default map: fewer neighbours than this is a flying pixel
 _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point may be free
 
 
-Surface = tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]
+Surface = tuple[int, Points, Values]
 
 
-def surface_points(
-    views: Sequence[Observation],
-    object_ids: Sequence[int],
-    plane: Plane | None,
-    bounded: bool = False,
-) -> list[Surface]:
-    """Return, per object and view, the observed points of its surface.
+def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
+    """Return class, observed points of its surface (world, metres) and half the width of their
+    pixels, per object and view of a map.
 
-    Points less than 3 mm (or three standard deviations of the noise) above the support surface
-    are its own, and points that stand alone are flying pixels, unless they are beside others.
-
-    Args:
-        views: what was fitted.
-        object_ids: labels of the map's classes 1, 2, ...
-        plane: support surface.
-        bounded: whether the support surface ends, so that what is lower counts as well.
-
-    Returns:
-        Class, points (world, metres) and half the width of their pixels.
+    Points less than 3 mm (or three standard deviations of the noise) above the support surface are
+    its own, and points that stand alone are flying pixels, unless they are beside others. What is
+    lower counts as well if the support surface is `bounded`.
     """
     found = []
-    for view in views:
+    plane = map_.plane
+    for view in map_.views:
         points, labels = view.points()
         depth = np.asarray(view.depth, dtype=np.float64)[view.depth > 0]
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-        for k, object_id in enumerate(object_ids, start=1):
+        for k, object_id in enumerate(map_.object_ids, start=1):
             own = np.flatnonzero(labels == object_id)
             own = own[beside(points[own], ~stray_points(points[own], _STRAY_SHARE))]
             if plane is not None:
@@ -68,27 +58,10 @@ def surface_points(
     return found
 
 
-def off_level_set(
-    points: Float[np.ndarray, "n 3"], distance: Float32[np.ndarray, "nx ny nz"], grid: Grid
-) -> Bool[np.ndarray, " n"]:
+def off_level_set(points: Points, distance: Nodes, grid: Grid) -> Chosen:
     """Which points lie more than 4 mm off the level set, by the distance of every grid node to
     it (metres). Nearer ones are its own business: marking them would only thicken it."""
-    return _bound(points, distance, grid) > _OFF
-
-
-def _bound(
-    points: Float[np.ndarray, "n 3"], distance: Float32[np.ndarray, "nx ny nz"], grid: Grid
-) -> Float[np.ndarray, " n"]:
-    """Lower bound of each point's distance to the level set, metres."""
-    out = np.empty(len(points))
-
-    def look(piece: slice) -> None:
-        kernels.lower_bounds(
-            points, grid.origin, grid.spacing, distance, False, out, piece.start, piece.stop
-        )
-
-    run_chunked(look, len(points), 1 << 14)
-    return out
+    return lower_bounds(points, grid, distance) > _OFF
 
 
 _TALLEST = 0.4  # metres above the support surface; what stands on a table is rarely taller
@@ -113,34 +86,30 @@ class Cone:
     """Where an object may be, along the rays of pixels that carry its label and no depth.
 
     Attributes:
-        object_id: the label.
-        pixels: (n, 2) row and column.
-        rays: (n, 3) world directions at depth 1.
         start, end: (n,) depths, metres.
     """
 
-    object_id: int
-    pixels: Int[np.ndarray, "n 2"]
-    rays: Float[np.ndarray, "n 3"]
-    start: Float[np.ndarray, " n"]
-    end: Float[np.ndarray, " n"]
+    object_id: int  # the label
+    pixels: Int[np.ndarray, "n 2"]  # row and column
+    rays: Points  # world directions at depth 1
+    start: Values
+    end: Values
 
 
 def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     """Return where the `lost_objects` may be, an entry for each that has more than small holes.
 
-    The cone of a pixel without a return runs from the nearest depth at which the object's
-    surface is plausible to the farthest, or to the support surface. Nearest is the farthest of:
-    the upright plane through the front of its foot, of its other points and of what is seen
-    beside its mask, moved towards the camera by half its width; the height of 40 cm; and its
-    own nearest seen surface, continued towards the camera at two metres per metre. Farthest is
-    that surface continued away from the camera. Holes of up to four pixels, as noise leaves
-    them in what was seen, have no cone.
+    The cone of a pixel without a return runs from the nearest depth at which the object's surface
+    is plausible to the farthest, or to the support surface. Nearest is the farthest of: the upright
+    plane through the front of its foot, of its other points and of what is seen beside its mask,
+    moved towards the camera by half its width; the height of 40 cm; and its own nearest seen
+    surface, continued towards the camera at two metres per metre. Farthest is that surface
+    continued away from the camera. Holes of up to four pixels, noise, have no cone.
     """
     found: list[Cone] = []
     for object_id in lost_objects(view):
         whole = view.labels == object_id
-        window = _window(whole, _HOLE)
+        window = bounding(whole, _HOLE)
         mask, depth = whole[window], view.depth[window].astype(np.float64)
         lost = mask & (depth == 0)
         lost &= ~ndimage.binary_closing(mask & ~lost, np.ones((_HOLE, _HOLE), dtype=bool))
@@ -162,22 +131,9 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     return found
 
 
-def _window(mask: Bool[np.ndarray, "h w"], margin: int) -> tuple[slice, slice]:
-    """Rows and columns of the mask's box, grown by a margin within the image."""
-    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return (
-        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
-        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
-    )
-
-
 def lost_points(
-    view: Observation,
-    cones: Sequence[Cone],
-    lower: Float[np.ndarray, " 3"],
-    upper: Float[np.ndarray, " 3"],
-    step: float,
-) -> Iterator[tuple[int, Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]]:
+    view: Observation, cones: Sequence[Cone], lower: Vector, upper: Vector, step: float
+) -> Iterator[tuple[int, Points, Values]]:
     """Yield points `step` apart along a view's `lost_cones` in a box, with the half edge of
     cubes around them that hold the cones; piece by piece, with the object's id, world, metres."""
     eye = view.camera_center
@@ -201,9 +157,7 @@ def lost_points(
             yield cone.object_id, points, 0.71 * depth / focal + 0.5 * step
 
 
-def _beside_own_surface(
-    view: Observation, depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+def _beside_own_surface(view: Observation, depth: Image, mask: Mask) -> tuple[Image, Image]:
     """Nearest and farthest depth that the object's own seen pixels allow; 0, inf without any."""
     own = mask & (depth > 0)
     if not own.any():
@@ -226,12 +180,12 @@ def _beside_own_surface(
 def _before_foot(
     view: Observation,
     plane: Plane,
-    mask: Bool[np.ndarray, "h w"],
-    lost: Bool[np.ndarray, "h w"],
+    mask: Mask,
+    lost: Mask,
     rays: Float[np.ndarray, "h w 3"],
     points: Float[np.ndarray, "h w 3"],
-    at_plane: Float[np.ndarray, "h w"],
-) -> Float[np.ndarray, "h w"]:
+    at_plane: Image,
+) -> Image:
     """Nearest depth (m) by where the object can stand and how tall it can be."""
     eye = view.camera_center
     height = float(plane.signed_distance(eye))
@@ -260,3 +214,40 @@ def _before_foot(
     with np.errstate(divide="ignore", invalid="ignore"):
         at_front = np.where(along > 0.0, front / along, 0.0)
     return np.maximum(np.maximum(below_top, at_front), 0.0)
+
+
+RIM = 0.05  # metres around the seen part of the support surface that count as part of it
+_BAND = 0.01  # metres at a depth of 1 m within which a point is of the surface
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSupport:
+    """Everything under the convex hull (`region`), grown by `RIM`, of what was seen of a plane."""
+
+    plane: Plane
+    region: TableRegion
+
+    def signed_distance(self, points: Points) -> Values:
+        """Lower bound of the distance from world points, metres, negative inside. Exact but for
+        points beyond a corner of the hull."""
+        flat = points @ self.region.axes.T
+        beside = np.full(len(points), -np.inf)
+        for a, b, c in self.region.halfplanes:
+            np.maximum(beside, flat @ np.array([a, b]) + c - RIM, out=beside)
+        above = self.plane.signed_distance(points)
+        outside = np.hypot(np.maximum(beside, 0.0), np.maximum(above, 0.0))
+        return np.asarray(outside + np.minimum(np.maximum(beside, above), 0.0))
+
+
+def seen_support(views: Sequence[Observation], plane: Plane) -> SeenSupport:
+    """Bound a support plane to what the views saw of it.
+
+    Raises:
+        PlaneNotFoundError: they saw no patch of 6 cm x 6 cm of it.
+    """
+    kept = [np.empty((0, 3))]
+    for view in views:
+        points, labels = view.points()
+        band = inlier_band(view.depth[view.depth > 0], _BAND)
+        kept.append(points[(np.abs(plane.signed_distance(points)) < band) & (labels == 0)])
+    return SeenSupport(plane, table_region(plane, np.concatenate(kept)))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the cameras saw, what they could not see, and where they did not look.
 
-A cell counts as seen only if one view sees all of it: every pixel that its image
-touches has a return, and the nearest of them lies no more than the tolerance in front
-of the cell's far side. So shadows are never too small, whatever the cell's size.
+A cell counts as seen only if one view sees all of it: every pixel that its image touches has a
+return, and the nearest of them lies no more than the tolerance in front of the cell's far side. So
+shadows are never too small, whatever the cell's size.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,12 +20,13 @@ from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.balls import within_balls
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points
 from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.grid import Balls, Chosen, Image, Points, Values, Vector, window
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
 _NEAR = 0.1
 
 
-def free_balls(observations: Iterable[Observation]) -> Float[np.ndarray, "s 4"]:
+def free_balls(observations: Iterable[Observation]) -> Balls:
     """Balls (world, metres) in which there was nothing but the pictured robot."""
     found = [np.empty((0, 4))]
     for observation in observations:
@@ -37,17 +38,11 @@ def free_balls(observations: Iterable[Observation]) -> Float[np.ndarray, "s 4"]:
 
 
 def speaking_against(
-    observation: Observation, things: Bool[np.ndarray, "h w"], balls: Float[np.ndarray, "s 4"]
-) -> Float[np.ndarray, "h w"]:
-    """Depth (metres) of the pixels behind which the balls are not believed, inf elsewhere.
-
-    These are what shows a thing within 10 cm of a ball, and all that shows the same object.
-
-    Args:
-        observation: a view.
-        things: pixels that show neither the robot nor the support surface.
-        balls: of `free_balls`, all views together.
-    """
+    observation: Observation, things: Bool[np.ndarray, "h w"], balls: Balls
+) -> Image:
+    """Depth (metres) of the pixels behind which the balls are not believed, inf elsewhere: what
+    of the things (neither robot nor support surface) shows something within 10 cm of a ball of
+    any view, and all that shows the same object."""
     near = np.zeros(observation.shape, dtype=bool)
     if not len(balls):
         return np.full(observation.shape, np.inf)
@@ -59,25 +54,9 @@ def speaking_against(
     return np.where(near, np.asarray(observation.depth, dtype=np.float64), np.inf)
 
 
-def cells_within(
-    balls: Float[np.ndarray, "s 4"],
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    shape: tuple[int, int, int],
-) -> tuple[tuple[slice, slice, slice], Bool[np.ndarray, "x y z"]]:
-    """Part of a lattice around the balls, and its cells that lie wholly in one of them."""
-    low = np.floor(((balls[:, :3] - balls[:, 3:]).min(axis=0) - origin) / spacing)
-    high = np.ceil(((balls[:, :3] + balls[:, 3:]).max(axis=0) - origin) / spacing)
-    low = np.clip(low, 0, shape).astype(np.int64)
-    high = np.clip(high, low, shape).astype(np.int64)
-    x, y, z = (slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-    marked = np.zeros(tuple(high - low), dtype=bool)
-    kernels.mark_cells_within(balls, origin + spacing * low, spacing, marked)
-    return (x, y, z), marked
-
-
-# Codes of points.
+# Codes of points, and the names of space that nobody has seen.
 SEEN, OCCLUDED, UNOBSERVED, OUTSIDE = 0, 1, 2, 3
+UNSEEN = {OCCLUDED: "occluded", UNOBSERVED: "unobserved", OUTSIDE: "outside"}
 # Of a point, a kernel's "partly" means that some pixel around it has the point in shadow.
 _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
@@ -87,25 +66,18 @@ THIN = 0.003
 
 @dataclass(frozen=True)
 class View:
-    """One depth image, ready to be asked what it says of a cell.
+    """One depth image, ready to be asked what it says of a cell."""
 
-    Attributes:
-        camera: (3, 4) world to camera.
-        optics: fx, fy, cx, cy, pixels.
-        reach: (levels, H, W) sparse tables: entry (k, v, u) is the minimum over the
-            2^k x 2^k window that begins at (v, u) of depth plus tolerance; infinite
-            where there is no return or the support plane was seen.
-        holes: the same, 0 where there is no return and 1 elsewhere.
-        robot: (S, 4) balls that held the robot, world, metres: nothing else is there ...
-        against: ... but behind what this view shows in or near any view's balls: like `reach`,
-            infinite elsewhere. None if there is nothing of the kind.
-    """
-
-    camera: Float[np.ndarray, "3 4"]
-    optics: Float[np.ndarray, " 4"]
+    camera: Float[np.ndarray, "3 4"]  # world to camera
+    optics: Float[np.ndarray, " 4"]  # fx, fy, cx, cy, pixels
+    # sparse tables: entry (k, v, u) is the minimum over the 2^k x 2^k window that begins at (v,
+    # u) of depth plus tolerance; infinite where there is no return or the support plane was seen
     reach: Float32[np.ndarray, "levels h w"]
-    holes: Float32[np.ndarray, "levels h w"]
-    robot: Float[np.ndarray, "s 4"] = field(default_factory=lambda: np.empty((0, 4)))
+    holes: Float32[np.ndarray, "levels h w"]  # the same, 0 where there is no return and 1 elsewhere
+    # balls that held the robot, world, metres: nothing else is there
+    robot: Balls = field(default_factory=lambda: np.empty((0, 4)))
+    # ... but behind what this view shows in or near any view's balls: like `reach`, infinite
+    # elsewhere. None if there is nothing of the kind
     against: Float32[np.ndarray, "levels h w"] | None = None
 
 
@@ -136,17 +108,15 @@ def make_view(
     observation: Observation,
     tolerance: float,
     plane: Plane | None = None,
-    robots: Float[np.ndarray, "s 4"] | None = None,
+    robots: Balls | None = None,
 ) -> View:
     """Prepare an observation; `tolerance` (metres) is how far behind a return shadow begins.
 
-    `robots` are the balls of the robots in all views of the scene; None: in this one.
-
-    The tolerance grows with the noise of the sensor: three standard deviations. A ray
-    that ends on the support plane (within that noise) or under it has passed through
-    free space only, as far as space above the plane goes: such pixels cast no shadow,
-    or the coarse cells on a table seen at a glance would all hide behind one another.
-    The robot casts one always, however low it is.
+    `robots` are the balls of the robots in all views of the scene; None: in this one. The tolerance
+    grows with the noise of the sensor: three standard deviations. A ray that ends on the support
+    plane (within that noise) or under it has passed through free space only, as far as space above
+    the plane goes: such pixels cast no shadow, or the coarse cells on a table seen at a glance
+    would all hide behind one another. The robot casts one always.
     """
     depth = np.asarray(observation.depth, dtype=np.float64)
     valid = depth > 0
@@ -168,11 +138,7 @@ def make_view(
     return replace(view, robot=own, against=tables)
 
 
-def _view(
-    observation: Observation,
-    reach: Float[np.ndarray, "h w"],
-    valid: Bool[np.ndarray, "h w"],
-) -> View:
+def _view(observation: Observation, reach: Image, valid: Bool[np.ndarray, "h w"]) -> View:
     K, rotation = observation.intrinsics, observation.pose[:3, :3].T
     camera = np.column_stack([rotation, -rotation @ observation.pose[:3, 3]])
     return View(
@@ -183,41 +149,23 @@ def _view(
     )
 
 
-def shadow_behind(observation: Observation, start: Float[np.ndarray, "h w"]) -> View:
+def shadow_behind(observation: Observation, start: Image) -> View:
     """A view by which exactly what lies behind the depth `start` (metres, inf for nothing) of a
     pixel is hidden."""
     return _view(observation, start, np.ones(start.shape, dtype=bool))
-
-
-def behind(
-    observation: Observation,
-    start: Float[np.ndarray, "h w"],
-    plane: Plane | None,
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    shape: tuple[int, int, int],
-) -> Bool[np.ndarray, "nx ny nz"]:
-    """Cells (as for `classify_cells`) that reach behind the depth `start` (metres) of a pixel.
-
-    Pixels with an infinite `start` hide nothing.
-    """
-    status = classify_cells([shadow_behind(observation, start)], plane, origin, spacing, shape)
-    return (status == kernels.OCCLUDED) | (status == kernels.PARTLY)
 
 
 def classify_cells_around(
     views: Sequence[View],
     below: Sequence[View],
     plane: Plane,
-    origin: Float[np.ndarray, " 3"],
+    origin: Vector,
     spacing: float,
     shape: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "nx ny nz"]:
-    """`classify_cells` for a support plane that ends somewhere: what is lower counts as well.
-
-    Above the plane as `views` say, for which it casts no shadow; below, wherever a cell
-    reaches there, as the `below` views say, for which it hides things like any surface.
-    """
+    """`classify_cells` for a support plane that ends somewhere: above it as `views` say, for
+    which it casts no shadow; below, wherever a cell reaches there, as the `below` views say, for
+    which it hides things like any surface."""
     status = classify_cells(views, None, origin, spacing, shape)
     under = classify_cells(below, None, origin, spacing, shape)
     low = 0.5 * spacing * np.abs(plane.normal).sum()
@@ -232,16 +180,16 @@ def classify_cells_around(
 def classify_cells(
     views: Sequence[View],
     plane: Plane | None,
-    origin: Float[np.ndarray, " 3"],
+    origin: Vector,
     spacing: float,
     shape: tuple[int, int, int],
 ) -> UInt8[np.ndarray, "nx ny nz"]:
     """Status of every cell of a lattice: FREE, OCCLUDED, PARTLY or UNOBSERVED (`kernels`).
 
-    Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that
-    sees a cell outweighs any number that do not. Cells wholly under the support plane
-    are called FREE: the half-space answers for them. So are cells wholly in a ball of the
-    robot in any view, where no view shows something else before them (`pictured`).
+    Cell (i, j, k) spans spacing metres from origin + spacing * (i, j, k). A view that sees a cell
+    outweighs any number that do not. Cells wholly under the support plane are called FREE: the
+    half-space answers for them. So are cells wholly in a ball of the robot in any view, where no
+    view shows something else before them.
     """
     status = np.full(shape, kernels.UNOBSERVED, dtype=np.uint8)
     blocks = -(-shape[0] // _BLOCK)
@@ -249,16 +197,9 @@ def classify_cells(
 
         def look(piece: slice, view: View = view) -> None:
             kernels.classify_cells(
-                origin,
-                spacing,
-                view.camera,
-                view.optics,
-                view.reach,
-                view.holes,
-                status,
-                piece.start,
-                piece.stop,
-            )
+                origin, spacing, view.camera, view.optics, view.reach, view.holes, status,
+                piece.start, piece.stop,
+            )  # fmt: skip
 
         run_chunked(look, blocks, 2)
     if plane is not None:
@@ -274,22 +215,27 @@ def classify_cells(
     return status
 
 
+def robot_balls(views: Sequence[View]) -> Balls:
+    """Balls of the robots in all views."""
+    return np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+
+
 def _clear_robots(
-    views: Sequence[View],
-    origin: Float[np.ndarray, " 3"],
-    spacing: float,
-    status: UInt8[np.ndarray, "nx ny nz"],
+    views: Sequence[View], origin: Vector, spacing: float, status: UInt8[np.ndarray, "nx ny nz"]
 ) -> None:
     """Call the cells free in which a pictured robot was."""
-    balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+    balls = robot_balls(views)
     if not len(balls):
         return
-    window, robot = cells_within(balls, origin, spacing, status.shape)
-    part = status[window]
+    low = np.floor(((balls[:, :3] - balls[:, 3:]).min(axis=0) - origin) / spacing)
+    high = np.ceil(((balls[:, :3] + balls[:, 3:]).max(axis=0) - origin) / spacing)
+    low = np.clip(low, 0, status.shape).astype(np.int64)
+    part = status[window(low, np.clip(high, low, status.shape))]
+    corner, robot = origin + spacing * low, np.zeros(part.shape, dtype=bool)
+    kernels.mark_cells_within(balls, corner, spacing, robot)
     robot &= part != kernels.FREE
     if not robot.any():
         return
-    corner = origin + spacing * np.array([w.start for w in window])
     for view in views:
         if view.against is not None:
             code = np.full(part.shape, kernels.UNOBSERVED, dtype=np.uint8)
@@ -301,9 +247,7 @@ def _clear_robots(
     part[robot] = kernels.FREE
 
 
-def classify_points(
-    views: Sequence[View], points: Float[np.ndarray, "n 3"]
-) -> UInt8[np.ndarray, " n"]:
+def classify_points(views: Sequence[View], points: Points) -> UInt8[np.ndarray, " n"]:
     """Status of every point: SEEN, OCCLUDED or UNOBSERVED; SEEN also where the robot was."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     status = np.full(len(points), kernels.UNOBSERVED, dtype=np.uint8)
@@ -311,7 +255,7 @@ def classify_points(
         kernels.classify_points(
             points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
         )
-    balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in views)])
+    balls = robot_balls(views)
     hidden = np.flatnonzero(status != kernels.FREE) if len(balls) else np.empty(0, dtype=int)
     robot = hidden[within_balls(points[hidden], balls)]
     for view in views:
@@ -326,9 +270,7 @@ def classify_points(
     return _OF_POINT[status]
 
 
-def beside(
-    points: Float[np.ndarray, "n 3"], dense: Bool[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def beside(points: Points, dense: Chosen) -> Chosen:
     """Which points (m) are dense, or within half a block of one that is."""
     if dense.all() or not dense.any():
         return dense
@@ -345,13 +287,12 @@ def clutter_pixels(
 ) -> Bool[np.ndarray, "h w"]:
     """Which pixels show unlabelled things off the support plane.
 
-    "Off" is `height` metres, or three standard deviations of the depth noise as it
-    shows along the normal, if that is more. Without a plane every unlabelled pixel is.
-    Pixels of the robot are not clutter, nor, if `lone_share` is above 0, are points
-    that with all others off the plane fill less than that share of what a surface facing
-    the camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills
-    3 percent. What lies within 1.5 cm of a point that is none stays: tips and edges lack
-    half their surroundings. Below the plane is "off" as well if the support is `bounded`.
+    "Off" is `height` metres, or three standard deviations of the depth noise along the normal, if
+    that is more; below the plane as well if the support is `bounded`. Without a plane every
+    unlabelled pixel is. Pixels of the robot are not clutter, nor, if `lone_share` is above 0, are
+    points that with all others off the plane fill less than that share of what a surface facing the
+    camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills 3 percent. What
+    lies within 1.5 cm of a point that is none stays: tips and edges lack half their surroundings.
     """
     points, labels = view.points()
     valid = view.depth > 0
@@ -379,7 +320,7 @@ def background_points(
     height: float,
     lone_share: float = 0.0,
     bounded: bool = False,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+) -> tuple[Points, Values]:
     """Points of the `clutter_pixels`, and half the width of their pixels, metres."""
     kept, widths = [np.empty((0, 3))], [np.empty(0)]
     for view in views:
@@ -390,9 +331,7 @@ def background_points(
     return np.concatenate(kept), np.concatenate(widths)
 
 
-def clutter_depth(
-    view: Observation, plane: Plane | None, config: WorldConfig
-) -> Float[np.ndarray, "h w"]:
+def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
     """Depth (metres) from which unlabelled clutter hides what is behind it, inf elsewhere."""
     bounded = config.support == "seen"
     chosen = clutter_pixels(view, plane, config.background_height, config.lone_share, bounded)

@@ -13,11 +13,12 @@ from jaxtyping import Float, UInt8
 
 from vprism_plan.errors import WorldError
 from vprism_plan.world import visibility
-from vprism_plan.world.config import OccludedPolicy, WorldConfig
+from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
     NodeDistances,
+    at_nodes,
     bounds_on,
     checked_points,
     combine,
@@ -25,55 +26,43 @@ from vprism_plan.world.distance import (
     finish,
     round_down,
 )
-from vprism_plan.world.grid import Grid, choose_grid, grid_beyond
-from vprism_plan.world.known import HalfSpace, KnownMesh, Primitive
-from vprism_plan.world.levelset import lattice_refinement, trace_level_set
-from vprism_plan.world.marks import (
-    BACKGROUND,
-    CELLS,
-    OCCLUDED,
-    UNOBSERVED,
-    Evidence,
-    unmark,
-)
-from vprism_plan.world.posterior_worlds import PosteriorWorlds
-from vprism_plan.world.rasterize import rasterize_level_set, rasterize_mesh
-from vprism_plan.world.support import RIM, seen_support
+from vprism_plan.world.grid import Grid, Points, Vector, choose_grid, grid_beyond
+from vprism_plan.world.levelset import lattice_refinement, rasterize_level_set, trace_level_set
+from vprism_plan.world.marks import CELLS, Evidence, only, rasterize_mesh, unmark
+from vprism_plan.world.posterior_worlds import PosteriorWorlds, classes_of
+from vprism_plan.world.seen import RIM, seen_support
+from vprism_plan.world.sources import LAST_MARK, MARKED, SUPPORT, object_id
 
 _log = logging.getLogger(__name__)
 
 _MAX_OBJECTS = 250
-SUPPORT = "support surface"
 
 
 class World:
     """Obstacles made of a map, what its cameras saw and did not see, and known geometry.
 
-    Observed points of an object that lie more than a voxel off the level set (parts
-    too thin for the map's kernels) are obstacles of that object, too.
+    Observed points of an object that lie more than a voxel off the level set (parts too thin for
+    the map's kernels) are obstacles of that object, too.
 
-    Everything is baked on construction. Sources, in this order: one per object, then
-    "background", "occluded", "unobserved", labelled objects without any depth return, then
-    known geometry; the support surface and known half-spaces are not in the field but in
-    `planes`.
+    Everything is baked on construction. Sources, in this order: one per object, then "background",
+    "occluded", "unobserved", labelled objects without any depth return, then known geometry; the
+    support surface and known half-spaces are not in the field but in `planes`.
 
-    What was seen outside the grid, and its shadow, is kept on a coarse grid around it (nodes
-    10 cm apart, 4.4 m beyond its faces), so an obstacle there is up to two such steps nearer
-    than it is. Beyond that nothing was judged: everything counts as "unobserved" and as an
-    obstacle, whatever the policies say.
+    What was seen outside the grid, and its shadow, is kept on a coarse grid around it (nodes 10 cm
+    apart, 4.4 m beyond its faces), so an obstacle there is up to two such steps nearer than it is.
+    Beyond that nothing was judged: everything counts as "unobserved" and as an obstacle, whatever
+    the policies say.
 
     Args:
         map: a `VPrismMap`.
         config: resolution, level, policies and known geometry.
 
     Attributes:
-        map: the map.
-        config: the configuration.
         grid: nodes of the field.
-        field: distance to objects, background, occluded or unobserved space (by policy)
-            and known geometry.
-        planes: (P, 4) float64 rows (nx, ny, nz, offset): obstacles {x : n . x < offset},
-            metres; the support surface first, if the map has one. Read-only.
+        field: distance to objects, background, occluded or unobserved space (by policy) and known
+            geometry.
+        planes: (P, 4) float64 rows (nx, ny, nz, offset): obstacles {x : n . x < offset}, metres;
+            the support surface first, if the map has one. Read-only.
         plane_names: their names.
         sources: names that `field.source` indexes.
         timings: seconds per step of the bake.
@@ -89,18 +78,13 @@ class World:
         self._evidence = Evidence(map, self.config)
         self._bounded = self._evidence.bounded
         lost = self._evidence.without_depth
-        if len(map.object_ids) + len(lost) > _MAX_OBJECTS:
-            raise WorldError(
-                f"the map has {len(map.object_ids) + len(lost)} objects; a world holds at most "
-                f"{_MAX_OBJECTS}"
-            )
-        names = [f"object:{i}" for i in map.object_ids]
+        count = len(map.object_ids) + len(lost)
+        if count > _MAX_OBJECTS:
+            raise WorldError(f"the map has {count} objects; a world holds at most {_MAX_OBJECTS}")
         solids = [k for k in self.config.known if not isinstance(k, HalfSpace)]
         self.sources: tuple[str, ...] = (
-            *names,
-            "background",
-            "occluded",
-            "unobserved",
+            *(f"object:{i}" for i in map.object_ids),
+            *MARKED,
             *(f"object:{i}" for i in lost),
             *([SUPPORT] if self._bounded else []),
             *(f"known:{k.name}" for k in solids),
@@ -125,11 +109,11 @@ class World:
         self._marks_beyond = self._timed("beyond", self._mark_beyond)
         self._beyond, self._from_beyond = self._around(self._marks_beyond, True)
         known = self._timed("known geometry", self._known_distances, solids)
-        known += self._support_distances(self.grid)
+        known += self._solid_distances(self._support, SUPPORT, self.grid)
         self._known: NodeDistances = combine(known, self.grid)
         others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
         self.field: DistanceField = self._timed(
-            "combine", self._field, [self._objects, others, self._known]
+            "combine", self._field, [self._objects, *others, self._known]
         )
         self._said: tuple[str, ...] = ()
         self._lowered: World | None = None
@@ -152,8 +136,6 @@ class World:
         self.timings[name] = time.perf_counter() - start
         return result
 
-    # --- parts -----------------------------------------------------------------
-
     def _half_spaces(self) -> tuple[tuple[str, ...], Float[np.ndarray, "p 4"]]:
         names, rows = [], []
         if self.map.plane is not None and not self._bounded:
@@ -167,30 +149,24 @@ class World:
         planes.setflags(write=False)
         return tuple(names), planes
 
-    def _mark_certain(self, seen: bool) -> Lattice:
-        """Mark what is no business of the posterior's; with `seen`, all seen surfaces too."""
-        occluded: OccludedPolicy = "free" if self.config.occluded == "free" else "posterior"
-        return self._evidence.marks(occluded, self.grid, None if seen else self._objects.distance)
+    def _unseen_distances(self, marks: Lattice) -> list[NodeDistances]:
+        faces = [self._faces(self.grid)] if self.config.unobserved == "occupied" else []
+        return [self._marked_distances(marks, self.grid), *faces]
 
-    def _unseen_distances(self, lattice: Lattice) -> NodeDistances:
-        distance, label = distance_to_lattice(lattice, self.grid)
-        source = self._sources_of_marks()[label]
-        if self.config.unobserved == "occupied":
-            self._bound_by_faces(distance, source, self.grid)
-        return NodeDistances(distance, source)
+    def _marked_distances(self, marks: Lattice, grid: Grid) -> NodeDistances:
+        distance, label = distance_to_lattice(marks, grid)
+        return NodeDistances(distance, self._sources_of_marks()[label])
 
     def _sources_of_marks(self) -> np.ndarray:
         """Index into `sources` of each mark of `world.marks`, -1 for none, (256,)."""
-        classes = len(self.map.object_ids)
-        first = self.sources.index("unobserved") + 1
-        lost = len(self._evidence.without_depth)
-        names = np.full(256, -1, dtype=np.int16)
-        names[BACKGROUND] = self.sources.index("background")
-        names[OCCLUDED] = self.sources.index("occluded")
-        names[UNOBSERVED] = self.sources.index("unobserved")
-        marks = BACKGROUND + 1 + np.arange(classes + lost)
-        names[marks] = [*range(classes), *range(first, first + lost)]
-        return names
+        classes, lost = len(self.map.object_ids), len(self._evidence.without_depth)
+        index = np.full(256, -1, dtype=np.int16)
+        for name, mark in MARKED.items():
+            index[mark] = self.sources.index(name)
+        first = classes + len(MARKED)
+        marks = LAST_MARK + 1 + np.arange(classes + lost)
+        index[marks] = [*range(classes), *range(first, first + lost)]
+        return index
 
     def _mark_beyond(self) -> Lattice | None:
         """Mark what was seen outside the grid, unless all of that is an obstacle anyway."""
@@ -206,89 +182,70 @@ class World:
     def _around(
         self, marks: Lattice | None, faces: bool
     ) -> tuple[DistanceField | None, list[NodeDistances]]:
-        """The field of marks outside the grid, and what it says inside, if there are any.
-
-        With `faces`, everything farther away is an obstacle as well.
-        """
+        """The field of marks outside the grid, and what it says inside, if there are any. With
+        `faces`, everything farther away is an obstacle as well."""
         if marks is None:
             return None, []
         grid = self._grid_beyond
-        distance, label = distance_to_lattice(marks, grid)
-        nodes = NodeDistances(distance, self._sources_of_marks()[label])
-        inside = []
-        if np.isfinite(distance).any():
+        nodes, inside = self._marked_distances(marks, grid), []
+        if np.isfinite(nodes.distance).any():
             within = bounds_on(finish(nodes, grid, self.sources, False), self.grid)
             # All of it lies outside: the grid's faces are nearer.
-            np.maximum(within.distance, _distance_to_faces(self.grid), out=within.distance)
+            np.maximum(within.distance, self._faces(self.grid).distance, out=within.distance)
             inside = [within]
         if faces:
-            nodes = combine([nodes, *self._support_distances(grid)], grid)
-            self._bound_by_faces(nodes.distance, nodes.source, grid)
+            support = self._solid_distances(self._support, SUPPORT, grid)
+            nodes = combine([nodes, *support, self._faces(grid)], grid)
         return finish(nodes, grid, self.sources, faces), inside
 
-    def _support_distances(self, grid: Grid) -> list[NodeDistances]:
-        if self._support is None:
+    def _solid_distances(self, solid: Any, name: str, grid: Grid) -> list[NodeDistances]:
+        """Distances of nodes to what has a signed distance, rounded down; none to None."""
+        if solid is None:
             return []
-        return [self._solid_distances(self._support, SUPPORT, grid)]
+        distance = at_nodes(grid, lambda points: solid.signed_distance(points) - 1e-9)
+        return [NodeDistances(distance, self._all_of(name, grid))]
 
-    def _solid_distances(self, solid: Any, name: str, grid: Grid) -> NodeDistances:
-        """Distances of nodes to what has a signed distance, rounded down."""
-        distance = np.empty(grid.shape, dtype=np.float32)
-        for start in range(0, grid.shape[0], 16):
-            stop = min(start + 16, grid.shape[0])
-            outside = np.maximum(solid.signed_distance(grid.slab(start, stop)) - 1e-9, 0.0)
-            distance[start:stop] = round_down(outside).reshape(-1, *grid.shape[1:])
-        source = np.full(grid.shape, self.sources.index(name), dtype=np.int16)
-        return NodeDistances(distance, source)
+    def _all_of(self, name: str, grid: Grid) -> np.ndarray:
+        return np.full(grid.shape, self.sources.index(name), dtype=np.int16)
 
-    def _bound_by_faces(self, distance: np.ndarray, source: np.ndarray, grid: Grid) -> None:
-        """Count everything outside a grid as unobserved, and as an obstacle."""
-        away = _distance_to_faces(grid)
-        closer = away < distance
-        np.copyto(distance, away, where=closer)
-        np.copyto(source, np.int16(self.sources.index("unobserved")), where=closer)
+    def _faces(self, grid: Grid) -> NodeDistances:
+        """Distance from every node to the nearest face of a grid's box: beyond is unobserved."""
+        x, y, z = (np.minimum(np.arange(n), np.arange(n)[::-1]) for n in grid.shape)
+        steps = np.minimum(np.minimum(x[:, None, None], y[None, :, None]), z)
+        distance = round_down(grid.spacing * steps.astype(np.float64))
+        return NodeDistances(distance, self._all_of("unobserved", grid))
 
     def _object_distances(self, classes: Collection[int] | None) -> NodeDistances:
         """Distance to the level set (of some classes only); class k is source k - 1."""
         lattice = rasterize_level_set(self._level_set, self._factor, classes)
         if lattice is None:
-            nothing = np.full(self.grid.shape, np.inf, dtype=np.float32)
-            return NodeDistances(nothing, np.full(self.grid.shape, -1, dtype=np.int16))
+            return combine([], self.grid)
         distance, label = distance_to_lattice(lattice, self.grid)
         return NodeDistances(distance, label.astype(np.int16) - np.int16(1))
 
-    def _known_distances(self, solids: list[Primitive | KnownMesh]) -> list[NodeDistances]:
+    def _known_distances(self, solids: list[Any]) -> list[NodeDistances]:
         parts = []
         for item in solids:
             name = f"known:{item.name}"
             if isinstance(item, KnownMesh):
-                lattice = rasterize_mesh(item, self.grid, CELLS)
-                distance, _ = distance_to_lattice(lattice, self.grid)
-                source = np.full(self.grid.shape, self.sources.index(name), dtype=np.int16)
-                parts.append(NodeDistances(distance, source))
+                distance, _ = distance_to_lattice(rasterize_mesh(item, self.grid, CELLS), self.grid)
+                parts.append(NodeDistances(distance, self._all_of(name, self.grid)))
             else:
-                parts.append(self._solid_distances(item, name, self.grid))
+                parts += self._solid_distances(item, name, self.grid)
         return parts
 
     def _field(self, parts: list[NodeDistances], without: Collection[int] = ()) -> DistanceField:
         beyond, inside = self._beyond, self._from_beyond
         if without and self._marks_beyond is not None:
-            beyond, inside = self._around(unmark(self._marks_beyond, without, None), True)
+            beyond, inside = self._around(unmark(self._marks_beyond, without), True)
         nodes = combine([*parts, *inside], self.grid)
         outside = self.config.unobserved == "occupied"
         return finish(nodes, self.grid, self.sources, outside, beyond)
 
-    # --- queries ---------------------------------------------------------------
-
     def object_field(self, object_id: int) -> DistanceField:
-        """Distance to one object alone: where P(occupied) >= level and it is the likeliest.
-
-        Which object a point belongs to is resolved to half the grid's resolution.
-
-        Raises:
-            WorldError: the map has no such object.
-        """
-        (k,) = self._classes([object_id])
+        """Distance to one object alone: where P(occupied) >= level and it is the likeliest, to
+        half the grid's resolution; WorldError if the map has none."""
+        (k,) = classes_of(self.map, [object_id])
         key = ("only", frozenset([k]))
         if key not in self._cache:
             nodes = self._object_distances([k])
@@ -298,67 +255,101 @@ class World:
     def fields_without(self, object_ids: Collection[int]) -> DistanceField:
         """Return the combined field without some objects, for contacts that are allowed.
 
-        Occluded space inside the left-out objects' level set goes with them; occluded
-        space beyond it stays, as do all other sources.
-
-        Raises:
-            WorldError: the map has no such object.
+        Occluded space inside the left-out objects' level set goes with them; occluded space beyond
+        it stays, as do all other sources. WorldError if the map has no such object.
         """
-        gone = frozenset(self._classes(object_ids))
+        gone = frozenset(classes_of(self.map, object_ids))
         if not gone:
             return self.field
         key = ("without", gone)
         if key not in self._cache:
-            rest = set(range(1, len(self.map.object_ids) + 1)) - gone
-            kept = self._object_distances(rest)
-            unseen = self._unseen_distances(self._without(self._unseen, gone))
-            self._cache[key] = self._field([kept, unseen, self._known], gone)
+            parts = [self._object_distances(self._rest(gone))]
+            parts += self._unseen_distances(self._without(self._unseen, gone))
+            self._cache[key] = self._field([*parts, self._known], gone)
         return self._cache[key]
 
     def certain_field(
         self, without: Collection[int] = (), level_set: bool = False, seen: bool = False
     ) -> DistanceField:
-        """Distance to what is an obstacle whatever the posterior says.
-
-        Background, seen parts that the level set misses, known geometry, unobserved space
-        by its policy, and occluded space where the map has too little support to judge
-        (unless the policy is "free"). The rest is for `posterior_worlds` to say; with
-        `level_set`, the objects where P(occupied) >= level belong to it as well. The
-        objects `without`, and their seen parts, are left out. With `seen`, so does whatever
-        was seen of an object, wherever the level set is.
-
-        Raises:
-            WorldError: the map has no such object.
-        """
-        gone = frozenset(self._classes(without))
+        """Distance to what is an obstacle whatever the posterior says: background, seen parts that
+        the level set misses, known geometry, unobserved space by its policy, and occluded space
+        where the map has too little support to judge (unless the policy is "free"). The rest is for
+        `posterior_worlds` to say; with `level_set`, the objects where P(occupied) >= level belong
+        to it as well. The objects `without`, and their seen parts, are left out. With `seen`, so
+        does whatever was seen of an object, wherever the level set is. WorldError if the map has no
+        such object."""
+        gone = frozenset(classes_of(self.map, without))
         key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
         if key not in self._cache:
             if seen not in self._beyond_support:
+                occluded = "free" if self.config.occluded == "free" else "posterior"
+                objects = None if seen else self._objects.distance
                 self._beyond_support[seen] = self._timed(
-                    "visibility beyond support", self._mark_certain, seen
+                    "visibility beyond support", self._evidence.marks, occluded, self.grid, objects
                 )
-            kept = self._beyond_support[seen]
-            marks = self._without(kept, gone) if gone else kept
-            parts = [self._unseen_distances(marks), self._known]
+            marks = self._without(self._beyond_support[seen], gone)
+            parts = [*self._unseen_distances(marks), self._known]
             if level_set:
-                rest = set(range(1, len(self.map.object_ids) + 1)) - gone
-                parts.append(self._object_distances(rest))
+                parts.append(self._object_distances(self._rest(gone)))
             self._cache[key] = self._field(parts, gone)
         return self._cache[key]
+
+    def source_field(self, name: str, without: Collection[int] = ()) -> DistanceField:
+        """Distance to one of `sources` alone; baked on first use and kept.
+
+        At no node is it below `field`, so neither are the bounds between nodes; the smallest over
+        all sources is `field` wherever that is positive, less the end of what was judged, metres
+        away. An object's own field holds its level set and its seen surfaces off it. Of the objects
+        `without` the part of the occluded space, and of cells they share with this obstacle, is
+        left out, as `fields_without` does; nothing is, of their own. `source` is -1 everywhere if
+        there is no such obstacle.
+        """
+        if name not in self.sources:
+            raise WorldError(f"no source {name!r} in this world; it has {', '.join(self.sources)}")
+        gone = frozenset(classes_of(self.map, without))
+        if name.startswith(("known:", SUPPORT)) or object_id(name) in without:
+            gone = frozenset()
+        key = (name, gone)
+        if key not in self._cache:
+            self._cache[key] = self._bake_source(name, gone)
+        return self._cache[key]
+
+    def _bake_source(self, name: str, gone: frozenset[int]) -> DistanceField:
+        index, solid_outside = self.sources.index(name), False
+        beyond: DistanceField | None = None
+        if name.startswith("known:"):
+            parts = self._known_distances(
+                [k for k in self.config.known if f"known:{k.name}" == name]
+            )
+        elif name == SUPPORT:
+            far = self._grid_beyond
+            parts = self._solid_distances(self._support, name, self.grid)
+            rim = self._solid_distances(self._support, name, far)
+            beyond = finish(combine(rim, far), far, self.sources, False)
+        else:
+            mark = int(np.flatnonzero(self._sources_of_marks() == index)[0])
+            marks = only(self._without(self._unseen, gone), mark)
+            parts = [self._marked_distances(marks, self.grid)]
+            if index < len(self.map.object_ids):
+                parts.append(self._object_distances([index + 1]))
+            if self._marks_beyond is not None:
+                far_marks = only(unmark(self._marks_beyond, gone), mark)
+                beyond, inside = self._around(far_marks, False)
+                parts += inside
+            solid_outside = name == "unobserved" and self.config.unobserved == "occupied"
+        nodes = combine(parts, self.grid)
+        distance = nodes.distance
+        if solid_outside:  # the world's own distances stop at the faces of the grid
+            distance = np.minimum(distance, self._faces(self.grid).distance)
+        named = np.where(np.isfinite(distance), np.int16(index), np.int16(-1))
+        nodes = NodeDistances(distance, named)
+        return finish(nodes, self.grid, self.sources, solid_outside, beyond)
 
     def posterior_worlds(
         self, n_worlds: int = 256, seed: int = 0, reach: float = 0.2
     ) -> PosteriorWorlds:
-        """Return joint draws of the map on voxels of this world's resolution; kept and shared.
-
-        Args:
-            n_worlds: number of draws, a multiple of 64.
-            seed: of the draws.
-            reach: see `PosteriorWorlds`; draws with at least this reach are used again.
-
-        Raises:
-            WorldError: see `PosteriorWorlds`.
-        """
+        """Return joint draws of the map on voxels of this world's resolution, as
+        `PosteriorWorlds` does; those with at least this reach are kept and shared."""
         kept = self._draws.get((n_worlds, seed))
         if kept is None or kept.reach < reach:
             kept = PosteriorWorlds(self.map, n_worlds, seed, self.config.resolution, reach)
@@ -366,25 +357,20 @@ class World:
         return kept
 
     def _without(self, marks: Lattice, classes: Collection[int]) -> Lattice:
+        if not classes:
+            return marks
         inside = rasterize_level_set(self._level_set, self._factor, classes)
         return unmark(marks, classes, inside)
 
-    def _classes(self, object_ids: Collection[int]) -> list[int]:
-        valid = list(self.map.object_ids)
-        unknown = sorted(set(object_ids) - set(valid))
-        if unknown:
-            raise WorldError(f"no object {unknown[0]} in the map; it has {valid}")
-        return [valid.index(i) + 1 for i in object_ids]
+    def _rest(self, gone: Collection[int]) -> set[int]:
+        return set(range(1, len(self.map.object_ids) + 1)) - set(gone)
 
-    def status(self, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+    def status(self, points: Points) -> UInt8[np.ndarray, " n"]:
         """What the cameras know of each world point, whatever the policies say.
 
-        0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or
-        under the support surface. 2 (unobserved): outside every image, or no depth
-        return. 3: outside the grid and what was judged around it.
-
-        Raises:
-            WorldError: a point is not finite.
+        0: some view saw past it or up to it. 1 (occluded): behind what a view saw, or under the
+        support surface. 2 (unobserved): outside every image, or no depth return. 3: outside the
+        grid and what was judged around it. WorldError if one is not finite.
         """
         points = checked_points(points)
         status = visibility.classify_points(self._evidence.views, points)
@@ -415,15 +401,11 @@ class World:
         """What is usable but odd about what this world was made of."""
         return (*getattr(self.map, "warnings", ()), *self._said)
 
-    def for_base(self, base: Float[np.ndarray, " 3"]) -> "World":
-        """Return the world for a robot whose base stands there (world, metres).
-
-        This world, or with `support="auto"` and a base more than 5 cm below the support plane
-        one whose support surface ends where it was seen to end; baked once.
-
-        Raises:
-            PlaneNotFoundError: too little of the surface was seen to say where that is.
-        """
+    def for_base(self, base: Vector) -> "World":
+        """Return the world for a robot whose base stands there (world, metres): this one, or with
+        `support="auto"` and a base more than 5 cm below the support plane one whose support surface
+        ends where it was seen to end; baked once. PlaneNotFoundError if too little was seen to say
+        where."""
         plane = self.map.plane
         if self.config.support != "auto" or plane is None:
             return self
@@ -443,10 +425,3 @@ class World:
     def empty(self) -> bool:
         """Whether nothing but half-spaces is an obstacle in the grid."""
         return bool((self.field.source < 0).all())
-
-
-def _distance_to_faces(grid: Grid) -> np.ndarray:
-    """Distance from every node to the nearest face of the grid's box, metres."""
-    x, y, z = (np.minimum(np.arange(n), np.arange(n)[::-1]) for n in grid.shape)
-    steps = np.minimum(np.minimum(x[:, None, None], y[None, :, None]), z)
-    return round_down(grid.spacing * steps.astype(np.float64))

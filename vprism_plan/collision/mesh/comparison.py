@@ -4,36 +4,28 @@
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from vprism_plan.collision.inputs import Numbers, configurations
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import SEEN
+from vprism_plan.collision.packing import Configuration, Numbers, configurations
 from vprism_plan.collision.reports import Contact
+from vprism_plan.world.grid import Vector
+from vprism_plan.world.sources import SOURCES, object_id, source_of
 
 _TOLERANCE = 1e-5  # metres: FCL's own, where its iterations end
 # Grid steps that the field may refuse beyond a surface: its interpolation gives up less than
 # one (half a cell's diagonal), its cover less than half.
 _INFLATION = 1.5
-CauseKind = Literal[
-    "conservative spheres", "margin", "voxel inflation", "occluded", "unobserved", "background",
-    "thin seen part", "too small for the mesh",
-    "solids outside spheres", "coarse mesh", "rounding", "edge tolerance", "missed by the field",
-    "seen by a camera",
-    "contact rules", "posterior risk", "unexplained",
-]  # fmt: skip
-
-_WHY: dict[CauseKind, str] = {
+# Kinds of causes, and what they mean.
+CAUSES: dict[str, str] = {
     # the field refuses, meshes accept
     "conservative spheres": "the link's spheres reach it, its solids do not",
     "margin": "nothing touches, but the field's checker keeps a margin",
     "voxel inflation": "the field's cells reach beyond the surface",
-    "occluded": "no camera saw it, and meshes touch nothing that they ask about",
-    "unobserved": "no camera looked there, and meshes touch nothing that they ask about",
-    "background": "its cells reach farther than the points of the unlabelled clutter",
+    **{name: source.beyond for name, source in SOURCES.items() if source.beyond},
     "thin seen part": "its cells reach farther than the points of a part that the map smooths away",
     "too small for the mesh": "the object has no surface on the mesh's lattice",
     # meshes refuse, the field accepts
@@ -53,41 +45,28 @@ _WHY: dict[CauseKind, str] = {
 
 @dataclass(frozen=True)
 class Cause:
-    """Why one contact is refused by one checker and not by the other.
+    """Why one contact is refused by one checker and not by the other."""
 
-    Attributes:
-        kind: the cause.
-        link: link in contact.
-        body: what it touches.
-        amount: metres: how far the solids stay from the surface ("conservative spheres"),
-            the spheres do ("margin", "voxel inflation"), or the depth of the contact.
-    """
-
-    kind: CauseKind
-    link: str
-    body: str
+    kind: str  # the cause
+    link: str  # link in contact
+    body: str  # what it touches
+    # metres: how far the solids stay from the surface ("conservative spheres"), the spheres do
+    # ("margin", "voxel inflation"), or the depth of the contact
     amount: float
 
     def text(self) -> str:
         """Return the cause as one phrase."""
-        return f"{self.link} and {self.body}: {self.kind} ({_WHY[self.kind]})"
+        return f"{self.link} and {self.body}: {self.kind} ({CAUSES[self.kind]})"
 
 
 @dataclass(frozen=True)
 class Disagreement:
-    """A configuration on which two checkers disagree.
+    """A configuration on which two checkers disagree."""
 
-    Attributes:
-        index: row of the configurations that were compared.
-        field_valid: verdict of the checker on the distance field.
-        mesh_valid: verdict of the checker on meshes.
-        causes: one per contact of the checker that refuses, deepest first.
-    """
-
-    index: int
-    field_valid: bool
-    mesh_valid: bool
-    causes: tuple[Cause, ...]
+    index: int  # row of the configurations that were compared
+    field_valid: bool  # verdict of the checker on the distance field
+    mesh_valid: bool  # verdict of the checker on meshes
+    causes: tuple[Cause, ...]  # one per contact of the checker that refuses, deepest first
 
 
 @dataclass(frozen=True)
@@ -130,21 +109,13 @@ class Comparison:
 
 @dataclass(frozen=True)
 class PathFinding:
-    """A collision on an edge of a path.
+    """A collision on an edge of a path."""
 
-    Attributes:
-        edge: number of the edge; edge 0 leads from waypoint 0 to waypoint 1.
-        fraction: where on the edge, 0 to 1; the first of the configurations looked at.
-        configuration: the joint values there.
-        contacts: what touches what.
-        causes: why another checker accepted it, if one was named.
-    """
-
-    edge: int
-    fraction: float
-    configuration: tuple[float, ...]
-    contacts: tuple[Contact, ...]
-    causes: tuple[Cause, ...] = ()
+    edge: int  # number of the edge; edge 0 leads from waypoint 0 to waypoint 1
+    fraction: float  # where on the edge, 0 to 1; the first of the configurations looked at
+    configuration: tuple[float, ...]  # the joint values there
+    contacts: tuple[Contact, ...]  # what touches what
+    causes: tuple[Cause, ...] = ()  # why another checker accepted it, if one was named
 
     def text(self) -> str:
         """Return the finding in one line."""
@@ -202,11 +173,8 @@ def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
         Q: (n, dof) finite configurations.
 
     Returns:
-        The comparison. A disagreement has one cause per contact of the checker that
-        refuses: each of them alone would have made the difference.
-
-    Raises:
-        RobotError: Q does not have shape (n, dof) or is not finite.
+        A disagreement has one cause per contact of the checker that refuses: each of them alone
+        would have made the difference.
     """
     both, neither, found = 0, 0, []
     for index, q in enumerate(configurations(mesh_checker.robot, Q, finite=True)):
@@ -220,9 +188,7 @@ def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:
     return Comparison(both, neither, tuple(found))
 
 
-def causes_between(
-    checker: Any, mesh_checker: Any, q: Float[np.ndarray, "dof"]
-) -> tuple[Cause, ...]:
+def causes_between(checker: Any, mesh_checker: Any, q: Configuration) -> tuple[Cause, ...]:
     """Name why the two disagree on q; "edge tolerance" if both refuse it, empty if none does."""
     by_field = checker.explain(q)
     touching = mesh_checker.contacts(q)
@@ -233,13 +199,9 @@ def causes_between(
     return tuple(_of_field(checker, mesh_checker, contact, q) for contact in by_field.contacts)
 
 
-# --- the field refuses, meshes accept ------------------------------------------------
-
-
-def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
-    kind: Any
+def _of_field(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> Cause:
     amount = contact.depth
-    if contact.body in {"occluded", "unobserved", "background"}:
+    if contact.body in SOURCES and SOURCES[contact.body].beyond:
         kind = contact.body
     elif contact.kind == "risk":
         kind = "posterior risk"
@@ -258,9 +220,7 @@ def _of_field(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, 
     return Cause(kind, contact.link, contact.body, float(amount))
 
 
-def _of_surface(
-    checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]
-) -> tuple[CauseKind, float]:
+def _of_surface(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> tuple[str, float]:
     """Cause and amount where the field refuses a sphere for an object or known geometry."""
     margin = float(checker.config.margin)
     center = meshes.robot.sphere_centers(q)[contact.sphere]
@@ -272,7 +232,10 @@ def _of_surface(
     if gap <= margin:
         return "margin", gap
     if contact.kind == "object":
-        if not _level_set_refuses(checker, center, radius):
+        # The level sets alone, without thin seen parts.
+        fields = map(checker.world.object_field, checker.world.map.object_ids)
+        nearest = min(float(field.lower_bound(center[None])[0]) for field in fields)
+        if nearest - radius > margin:
             return "thin seen part", contact.depth
         if contact.body not in {body.name for body in meshes.surfaces.bodies}:
             return "too small for the mesh", contact.depth
@@ -280,13 +243,11 @@ def _of_surface(
     return "voxel inflation" if gap <= within else "unexplained", gap
 
 
-def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named: str) -> float:
-    """Signed distance of a ball to the surfaces of the kind that a contact names.
-
-    For an object: to any of them, since the field names the nearest to a grid node.
-    """
+def _ball_gap(meshes: Any, center: Vector, radius: float, named: str) -> float:
+    """Signed distance of a ball to the surfaces of the kind that a contact names. For an object: to
+    any of them, since the field names the nearest to a grid node."""
     surfaces = meshes.surfaces
-    objects = named.startswith("object:")
+    objects = object_id(named) is not None
     inside = objects and surfaces.object_at(center[None])[0] > 0
     best = math.inf
     for body in surfaces.bodies:
@@ -303,40 +264,27 @@ def _ball_gap(meshes: Any, center: Float[np.ndarray, "3"], radius: float, named:
     return best
 
 
-def _level_set_refuses(checker: Any, center: Float[np.ndarray, "3"], radius: float) -> bool:
-    """Whether the objects' level sets alone, without thin seen parts, refuse a sphere."""
-    world = checker.world
-    nearest = min(
-        float(world.object_field(i).lower_bound(center[None])[0]) for i in world.map.object_ids
-    )
-    return nearest - radius <= checker.config.margin
-
-
-# --- meshes refuse, the field accepts ------------------------------------------------
-
-
-def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Float[np.ndarray, "dof"]) -> Cause:
-    kind: CauseKind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
+def _of_mesh(checker: Any, meshes: Any, contact: Contact, q: Configuration) -> Cause:
+    bound = checker.config.max_risk  # draws judge objects in place of the level set above its level
+    draws_judge = bound is not None and bound >= checker.world.config.level
+    kind = "seen by a camera" if contact.detail == SEEN else "missed by the field"
     links = (contact.link, contact.body) if contact.kind == "self" else (contact.link,)
     if contact.position is None:
         kind = "unexplained"  # a joint limit: both know the same
-    elif contact.kind == "object" and _field_allows(checker, contact):
+    elif contact.kind == "object" and any(
+        object_id(contact.body) in ids and contact.link in checker.robot.links_of(name)
+        for name, ids in checker.config.allowed_contacts.items()
+    ):
         kind = "contact rules"
-    elif contact.kind == "object" and contact.detail != SEEN and _draws_judge(checker):
+    elif contact.kind == "object" and contact.detail != SEEN and draws_judge:
         kind = "posterior risk"
-    elif contact.depth <= _TOLERANCE and contact.kind not in ("occluded", "unobserved"):
+    elif contact.depth <= _TOLERANCE and not source_of(contact.body).policy:
         kind = "rounding"
     elif contact.sphere < 0 and not _in_spheres(meshes, q, links, contact):
         kind = "solids outside spheres"
     elif contact.kind == "object" and not contact.detail and not _in_level_set(checker, contact):
         kind = "coarse mesh"
     return Cause(kind, contact.link, contact.body, contact.depth)
-
-
-def _draws_judge(checker: Any) -> bool:
-    """Whether draws judge the objects in place of the level set: below its level, both do."""
-    bound = checker.config.max_risk
-    return bound is not None and bound >= checker.world.config.level
 
 
 def _in_level_set(checker: Any, contact: Contact) -> bool:
@@ -347,18 +295,7 @@ def _in_level_set(checker: Any, contact: Contact) -> bool:
     return bool((occupied >= checker.world.config.level).any())
 
 
-def _field_allows(checker: Any, contact: Contact) -> bool:
-    """Whether the field's checker lets the link touch the object."""
-    object_id = int(contact.body.split(":", 1)[1])
-    return any(
-        object_id in ids and contact.link in checker.robot.links_of(name)
-        for name, ids in checker.config.allowed_contacts.items()
-    )
-
-
-def _in_spheres(
-    meshes: Any, q: Float[np.ndarray, "dof"], links: tuple[str, ...], contact: Contact
-) -> bool:
+def _in_spheres(meshes: Any, q: Configuration, links: tuple[str, ...], contact: Contact) -> bool:
     """Whether the collision spheres of each link are as near to the place of a contact as the
     solids are, to FCL's tolerance."""
     point, apart = np.array(contact.position), max(0.0, contact.required - contact.depth)

@@ -2,10 +2,10 @@
 """The few calls of FCL that can be trusted, each with what it can and cannot say.
 
 Meshes are hollow to FCL; primitives are solid. What is left out on purpose: its continuous
-collision check (crashes or misses with meshes), its managers (a moved object that is not
-reported to them is looked for where it was, and exceptions in callbacks are swallowed), and
-its figures for a sphere that overlaps a mesh (depth and distance are garbage there; the
-distance from the sphere's centre is exact instead), and its signed distance.
+collision check (crashes or misses with meshes), its managers (a moved object that is not reported
+to them is looked for where it was, and exceptions in callbacks are swallowed), and its figures for
+a sphere that overlaps a mesh (depth and distance are garbage there; the distance from the sphere's
+centre is exact instead), and its signed distance.
 """
 
 from functools import cache
@@ -23,11 +23,7 @@ _MAX_CONTACTS = 256
 
 @cache
 def fcl() -> Any:
-    """Return the module python-fcl, imported on first use.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
+    """Return the module python-fcl, imported on first use; MissingDependencyError without it."""
     try:
         import fcl as module
     except ImportError as error:
@@ -38,13 +34,8 @@ def fcl() -> Any:
 
 
 class Shape:
-    """A shape FCL can be asked about, at a pose that can be changed.
-
-    Args:
-        kind: "sphere", "box", "cylinder" or "mesh".
-        size: as for `PrimitiveGeometry`; unused for a mesh.
-        mesh: `trimesh.Trimesh`, for a mesh.
-    """
+    """A shape FCL can be asked about, at a pose that can be changed: a "sphere", "box" or
+    "cylinder" with sizes as for `PrimitiveGeometry`, or a "mesh" (`trimesh.Trimesh`)."""
 
     def __init__(self, kind: str, size: tuple[float, ...] = (), mesh: Any = None) -> None:
         self.kind = kind
@@ -56,12 +47,8 @@ class Shape:
 
     def _geometry(self, mesh: Any) -> Any:
         module = fcl()
-        if self.kind == "sphere":
-            return module.Sphere(float(self.size[0]))
-        if self.kind == "box":
-            return module.Box(*(float(edge) for edge in self.size))
-        if self.kind == "cylinder":
-            return module.Cylinder(*(float(length) for length in self.size))
+        if self.kind != "mesh":
+            return getattr(module, self.kind.capitalize())(*map(float, self.size))
         vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
         faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
         self.normals = face_normals(vertices, faces)
@@ -104,8 +91,17 @@ def face_normals(
 
 def touches(a: Shape, b: Shape) -> bool:
     """Whether two shapes intersect; of a mesh, only its surface counts."""
-    module = fcl()
-    return bool(module.collide(a.body, b.body, module.CollisionRequest(), module.CollisionResult()))
+    return _collide(a.body, b.body) is not None
+
+
+def _collide(a: Any, b: Any, **wanted: Any) -> Any:
+    """FCL's result for two of its objects that touch, else None."""
+    result = fcl().CollisionResult()
+    return result if fcl().collide(a, b, fcl().CollisionRequest(**wanted), result) else None
+
+
+def _ball(point: Float[np.ndarray, "3"], radius: float) -> Any:
+    return fcl().CollisionObject(fcl().Sphere(radius), fcl().Transform(point))
 
 
 def gap(a: Shape, b: Shape) -> float:
@@ -118,10 +114,8 @@ def gap(a: Shape, b: Shape) -> float:
 
 
 def signed_gap(a: Shape, b: Shape) -> float:
-    """Distance between two solids (no meshes), metres; minus the way out where they overlap.
-
-    FCL's own signed distance errs by up to 0.2 mm; its distance and its depth do not.
-    """
+    """Distance between two solids (no meshes), metres; minus the way out where they overlap. FCL's
+    own signed distance errs by up to 0.2 mm; its distance and its depth do not."""
     touch = deepest_touch(a, b)
     return gap(a, b) if touch is None else touch[0]
 
@@ -130,10 +124,9 @@ def point_distance(
     shape: Shape, point: Float[np.ndarray, "3"]
 ) -> tuple[float, Float[np.ndarray, "3"]]:
     """Distance from a point to a mesh's surface, metres, and the nearest point on it (world)."""
-    module = fcl()
-    ball = module.CollisionObject(module.Sphere(_POINT_RADIUS), module.Transform(point))
+    module, ball = fcl(), _ball(point, _POINT_RADIUS)
     # The mesh goes first: FCL swaps the two otherwise, and the points with them.
-    if module.collide(shape.body, ball, module.CollisionRequest(), module.CollisionResult()):
+    if _collide(shape.body, ball) is not None:
         return 0.0, np.array(point)
     result = module.DistanceResult()
     request = module.DistanceRequest(enable_nearest_points=True)
@@ -144,10 +137,7 @@ def point_distance(
 
 def point_within(shape: Shape, point: Float[np.ndarray, "3"], reach: float) -> bool:
     """Whether a point is within `reach` (metres) of a mesh's surface."""
-    module = fcl()
-    ball = module.CollisionObject(module.Sphere(max(reach, _POINT_RADIUS)), module.Transform(point))
-    request, result = module.CollisionRequest(), module.CollisionResult()
-    return bool(module.collide(shape.body, ball, request, result))
+    return _collide(shape.body, _ball(point, max(reach, _POINT_RADIUS))) is not None
 
 
 def nearest_points(a: Shape, b: Shape) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
@@ -170,15 +160,13 @@ def deepest_touch(
     """Return where two shapes intersect most, or None: minus the depth (metres), where, and the
     unit vector that leads from the first to the second, world.
 
-    Between solids the depth is the way out; for a sphere and a mesh, how far the surface
-    reaches into the sphere. For other shapes and a mesh it is FCL's figure for the deepest
-    triangle, which is local: it says how far the solid reaches through one triangle, not
-    how far it has to move. A mesh's normal is the triangle's own.
+    Between solids the depth is the way out; for a sphere and a mesh, how far the surface reaches
+    into the sphere. For other shapes and a mesh it is FCL's figure for the deepest triangle, which
+    is local: it says how far the solid reaches through one triangle, not how far it has to move. A
+    mesh's normal is the triangle's own.
     """
-    module = fcl()
-    request = module.CollisionRequest(num_max_contacts=_MAX_CONTACTS, enable_contact=True)
-    result = module.CollisionResult()
-    if not module.collide(a.body, b.body, request, result):
+    result = _collide(a.body, b.body, num_max_contacts=_MAX_CONTACTS, enable_contact=True)
+    if result is None:
         return None
     found = max(result.contacts, key=lambda contact: float(contact.penetration_depth))
     depth = max(0.0, float(found.penetration_depth))

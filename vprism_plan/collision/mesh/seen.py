@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What the cameras saw off the support surface, and what they could not see, point by point.
-
-Of the map this takes the images alone: neither its classes nor the field have a say.
-"""
+"""What the cameras saw off the support surface, and what they could not see, point by point. Of the
+map this takes the images alone: neither its classes nor the field have a say."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +12,7 @@ from scipy.spatial import cKDTree
 from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
+from vprism_plan.world.grid import Chosen, Points, Values
 from vprism_plan.world.seen import lost_cones, lost_points, surface_points
 
 SEEN = "a camera saw it there"  # the detail of contacts with observed points
@@ -25,9 +24,9 @@ _ENOUGH = 64  # points of one body whose depth in a solid is worked out, those d
 class SeenPoints:
     """Observed points off the support surface, as balls of half their pixel's width.
 
-    Those of the robot are none, nor are flying pixels: the same pixels count as for the world,
-    but all of them, however near they lie to the map's surfaces. Where a labelled pixel has no
-    depth, the points where its object may be, a grid step apart.
+    Those of the robot are none, nor are flying pixels: the same pixels count as for the world, but
+    all of them, however near they lie to the map's surfaces. Where a labelled pixel has no depth,
+    the points where its object may be, a grid step apart.
 
     Attributes:
         bodies: what the points show, and how that is known: ("object:3", SEEN), ...
@@ -44,7 +43,7 @@ class SeenPoints:
             map_.views, map_.plane, config.background_height, config.lone_share, bounded
         )
         parts = [(0, points, half)]
-        parts += surface_points(map_.views, map_.object_ids, map_.plane, bounded)
+        parts += surface_points(map_, bounded)
         bodies = [("background", SEEN), *((f"object:{i}", SEEN) for i in map_.object_ids)]
         step, judged = config.resolution, judged_field(world)
         for view in map_.views:
@@ -64,7 +63,7 @@ class SeenPoints:
         self._tree = cKDTree(self.points)
         self._widest = float(np.max(self.half, initial=0.0))
 
-    def near(self, need: Float[np.ndarray, "n"]) -> list[int]:
+    def near(self, need: Values) -> list[int]:
         """Moving solids whose balls come within `need` (metres) of any point."""
         placed, reach = self._placed, self._placed.radii + need + self._widest
         most = float(np.max(reach[placed.moving], initial=0.0))
@@ -123,11 +122,11 @@ def judged_field(world: Any) -> Any:
 class HiddenSpace:
     """What no camera saw, by the world's policies, asked at points of the robot's surface.
 
-    One point per cube of 3 cm of each moving solid's surface, moved outward by its padding.
-    What lies between the points is not noticed.
+    One point per cube of 3 cm of each moving solid's surface, moved outward by its padding. What
+    lies between the points is not noticed.
     """
 
-    def __init__(self, world: Any, placed: PlacedSolids, padding: Float[np.ndarray, "n"]) -> None:
+    def __init__(self, world: Any, placed: PlacedSolids, padding: Values) -> None:
         map_, config = world.map, world.config
         self._map, self._config, self._placed = map_, config, placed
         self._plane = map_.plane
@@ -150,9 +149,7 @@ class HiddenSpace:
         self._solid, self._samples, self._outward = _samples(placed)
         self._samples += padding[self._solid, None] * self._outward
 
-    def find(
-        self, margin: float
-    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    def find(self, margin: float) -> tuple[Int[np.ndarray, "n"], Points, Int[np.ndarray, "n"]]:
         """Samples of the placed robot that are hidden once they are moved outward by a margin:
         their solids, places (world, metres) and codes (`visibility.OCCLUDED` or `UNOBSERVED`)."""
         if self._idle or len(self._samples) == 0:
@@ -163,7 +160,7 @@ class HiddenSpace:
         hit = np.flatnonzero(codes)
         return self._solid[hit], points[hit], codes[hit]
 
-    def codes(self, points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    def codes(self, points: Points) -> Int[np.ndarray, "n"]:
         """OCCLUDED or UNOBSERVED for each point (world) that the policies refuse, else 0."""
         config = self._config
         under = np.zeros(len(points), dtype=bool)
@@ -192,13 +189,9 @@ class HiddenSpace:
             codes[under] = 0  # the half-space answers there
         return codes
 
-    def _leave_to_posterior(
-        self, points: Float[np.ndarray, "n 3"], hidden: Bool[np.ndarray, "n"]
-    ) -> None:
-        """Call what the map has support for not hidden, unless clutter hides it.
-
-        Half the support is enough here: the world asks at the middle of a cell.
-        """
+    def _leave_to_posterior(self, points: Points, hidden: Chosen) -> None:
+        """Call what the map has support for not hidden, unless clutter hides it. Half the support
+        is enough here: the world asks at the middle of a cell."""
         rows = np.flatnonzero(hidden)
         if len(rows) == 0:
             return
