@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 # The file of each command; there `run_COMMAND(command, console)` returns the exit code.
 _FILES = {
-    "demo": "_demo", "map": "_maps", "mesh": "_maps", "plan": "_motions", "query": "_query",
-    "view": "_view", "robot": "_robot",
+    "demo": "_plans", "map": "_maps", "mesh": "_maps", "plan": "_plans", "query": "_inspect",
+    "view": "_inspect", "robot": "_inspect",
 }  # fmt: skip
 DONE, NO_SAFE_ANSWER, BAD_INPUT, DEFECT, INTERRUPTED = 0, 1, 2, 3, 130
 

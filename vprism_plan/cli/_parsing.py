@@ -94,6 +94,7 @@ def _demo(command: _Parser) -> None:
     """Fit a map of the bundled scene, plan a Panda arm across it, write pictures and results."""
     _results(command, "out/demo")
     command.take("--seed N", int, "of the fit and of the planner", 0)
+    command.set_defaults(planner="RRTConnect", time_limit=5.0)
 
 
 def _map(command: _Parser) -> None:

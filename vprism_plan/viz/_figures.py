@@ -69,9 +69,7 @@ def hatched(label: str, hatch: str) -> Patch:
     return Patch(facecolor="#555555", edgecolor="white", hatch=hatch, label=label)
 
 
-def legend_below(
-    figure: Figure, entries: Sequence[Line2D | Patch], columns: int, *, dark: bool = False
-) -> None:
+def legend(figure: Figure, entries: Sequence[Any], columns: int, *, dark: bool = False) -> None:
     """Put a legend under all panels; a dark one shows lines that are white on the map."""
     style = {"facecolor": "#555555", "labelcolor": "white", "framealpha": 1.0} if dark else {}
     figure.legend(handles=entries, loc="outside lower center", ncols=columns, **style)

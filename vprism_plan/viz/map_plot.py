@@ -11,14 +11,7 @@ from matplotlib.figure import Figure
 
 from vprism_plan.perception import Observation
 from vprism_plan.perception.camera import invert_transform, project, transform_points
-from vprism_plan.viz._figures import (
-    hatched,
-    legend_below,
-    line,
-    name_axes,
-    new_figure,
-    object_color,
-)
+from vprism_plan.viz._figures import hatched, legend, line, name_axes, new_figure, object_color
 
 if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
@@ -141,7 +134,7 @@ def map_figure(
     ]
     if truth is not None:
         entries.append(line("true outline (not given to the map)", color="#ff5fa2", linestyle="--"))
-    legend_below(figure, entries, 3, dark=True)
+    legend(figure, entries, 3, dark=True)
     return figure
 
 

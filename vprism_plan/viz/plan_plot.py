@@ -10,7 +10,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from vprism_plan.viz._figures import legend_below, line, new_figure, object_color, show_picture
+from vprism_plan.viz._figures import legend, line, new_figure, object_color, show_picture
 from vprism_plan.viz._raster import Film, Layer, View, corners, ground, halved, sphere_ends
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def plan_figure(
         line("path of the hand", color=HAND_COLOR, linewidth=3),
         *(Patch(color=tuple(object_color(k)), label=f"object {k}") for k in sorted(meshes)),
     ]
-    legend_below(figure, entries, max(1, int(figure.get_figwidth() / 1.7)))
+    legend(figure, entries, max(1, int(figure.get_figwidth() / 1.7)))
     return figure
 
 

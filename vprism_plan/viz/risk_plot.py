@@ -9,14 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vprism_plan.viz._figures import (
-    hatched,
-    legend_below,
-    line,
-    name_axes,
-    new_figure,
-    object_color,
-)
+from vprism_plan.viz._figures import hatched, legend, line, name_axes, new_figure, object_color
 from vprism_plan.viz.map_plot import Slice, draw_slice, hatch, object_points
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path
 
@@ -85,7 +78,7 @@ def risk_figure(
         line("robot at the goal", color=GOAL_COLOR, linewidth=2),
         line("path of the hand, from above", color=HAND_COLOR, linewidth=2),
     ]
-    legend_below(figure, entries, 4, dark=True)
+    legend(figure, entries, 4, dark=True)
     return figure
 
 

@@ -10,14 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vprism_plan.viz._figures import (
-    PALETTE,
-    legend_below,
-    line,
-    name_axes,
-    new_figure,
-    object_color,
-)
+from vprism_plan.viz._figures import PALETTE, legend, line, name_axes, new_figure, object_color
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path, resample
 
 if TYPE_CHECKING:
@@ -100,7 +93,7 @@ def trajopt_figure(
         Patch(color=tuple(_OTHER), label="other obstacles"),
         *(Patch(color=tuple(_shade(i)), label=f"object {i}") for i in world.map.object_ids),
     ]
-    legend_below(figure, entries, 5)
+    legend(figure, entries, 5)
     return figure
 
 
