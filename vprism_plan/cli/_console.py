@@ -30,12 +30,10 @@ class Console:
     """
 
     def __init__(self, *, as_json: bool = False, strict: bool = False) -> None:
-        self.as_json = as_json
-        self.strict = strict
+        self.as_json, self.strict = as_json, strict
         self.warnings: list[str] = []
         self.timings: dict[str, float] = {}
-        self.compile_seconds = 0.0
-        self.compiled = 0
+        self.compile_seconds, self.compiled = 0.0, 0
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

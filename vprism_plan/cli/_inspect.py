@@ -17,11 +17,8 @@ from vprism_plan.cli._plans import bake, checks
 from vprism_plan.errors import ConfigError, MapError, PlanningError
 
 if TYPE_CHECKING:
-    from vprism_plan.collision import StateReport
-    from vprism_plan.collision.entropy import PathEntropy
     from vprism_plan.mapping import VPrismMap
-    from vprism_plan.planning import Trajectory
-    from vprism_plan.robots import Robot, RobotReport
+    from vprism_plan.robots import Robot
 
 _OFTEN = 0.3  # of random configurations: a pair of links that overlaps in more is named
 
@@ -58,37 +55,28 @@ def run_query(command: Command, console: Console) -> int:
         "compile_seconds": console.compile_seconds,
     }
     rows = len(margins.margins) if command.rows == 0 else max(command.rows, 0)
+    known = "none, the robot is nowhere near what the map knows"
+    if not np.isnan(entropy.waypoint_mean[0]):
+        known = (
+            f"mean {entropy.waypoint_mean[0]:.2f} nats, largest of a sphere "
+            f"{entropy.waypoint_max[0]:.2f}; {100 * entropy.waypoint_unsupported[0]:.0f} % of the "
+            "robot's volume without support"
+        )
     unseen = ", ".join(f"{kind} {100 * share:.0f} %" for kind, share in report.shares.items())
     lines = [
-        *_verdict(report),
-        risk.text(),
-        *margins.text(rows).splitlines(),
-        _entropy_line(entropy),
-        f"volume not seen: {unseen or 'none'}",
-        f"base at {np.round(robot.base_pose[:3, 3], 3).tolist()} m",
-    ]
-    console.finish(payload, lines)
-    return 0 if report.valid else 1
-
-
-def _verdict(report: "StateReport") -> list[str]:
-    return [
         f"{'free' if report.valid else 'refused'}: clearance {1000 * report.clearance:.1f} mm "
         f"(required {1000 * report.margin:.1f} mm), self-clearance "
         f"{1000 * report.self_clearance:.1f} mm",
         *(f"  {contact.text()}" for contact in report.contacts),
         *(f"  allowed: {c.link} touches {c.body}" for c in report.allowed),
+        risk.text(),
+        *margins.text(rows).splitlines(),
+        f"map entropy: {known}",
+        f"volume not seen: {unseen or 'none'}",
+        f"base at {np.round(robot.base_pose[:3, 3], 3).tolist()} m",
     ]
-
-
-def _entropy_line(entropy: "PathEntropy") -> str:
-    if np.isnan(entropy.waypoint_mean[0]):
-        return "map entropy: none, the robot is nowhere near what the map knows"
-    return (
-        f"map entropy: mean {entropy.waypoint_mean[0]:.2f} nats, largest of a sphere "
-        f"{entropy.waypoint_max[0]:.2f}; {100 * entropy.waypoint_unsupported[0]:.0f} % of the "
-        "robot's volume without support"
-    )
+    console.finish(payload, lines)
+    return 0 if report.valid else 1
 
 
 def run_robot(command: Command, console: Console) -> int:
@@ -123,23 +111,6 @@ def run_robot(command: Command, console: Console) -> int:
             save_figure(robot_figure(robot), command.picture)
     outputs = (command.spheres_output, command.srdf_output, command.picture)
     written = [path for path in outputs if path is not None]
-    payload = {
-        **report.to_dict(),
-        "often_touching": often,
-        "locked": robot.locked,
-        "lower": robot.lower,
-        "upper": robot.upper,
-        "continuous": robot.continuous,
-        "seconds": time.perf_counter() - began,
-        "timings": console.timings,
-        "written": written,
-    }
-    lines = [*_robot_lines(robot, report, often), *(f"wrote {path}" for path in written)]
-    console.finish(payload, lines)
-    return 0
-
-
-def _robot_lines(robot: "Robot", report: "RobotReport", often: list[Any]) -> list[str]:
     locked = f"; locked: {', '.join(robot.locked)}" if robot.locked else ""
     reasons = Counter(reason or "no reason given" for *_, reason in report.disabled_pairs)
     counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
@@ -153,7 +124,18 @@ def _robot_lines(robot: "Robot", report: "RobotReport", often: list[Any]) -> lis
         verdict = "some meshes are missing, so nothing is known of their links"
     else:
         verdict = "unknown whether they enclose the links: there is no geometry to compare with"
-    return [
+    payload = {
+        **report.to_dict(),
+        "often_touching": often,
+        "locked": robot.locked,
+        "lower": robot.lower,
+        "upper": robot.upper,
+        "continuous": robot.continuous,
+        "seconds": time.perf_counter() - began,
+        "timings": console.timings,
+        "written": written,
+    }
+    lines = [
         f"{robot.name}: {robot.dof} joints ({', '.join(robot.joint_names)}){locked}",
         *report.text().splitlines(),
         f"{report.spheres} spheres; {verdict}; they stand out by "
@@ -163,7 +145,10 @@ def _robot_lines(robot: "Robot", report: "RobotReport", often: list[Any]) -> lis
             f"  {a} and {b} overlap in {100 * share:.0f} % of random configurations"
             for a, b, share in often
         ),
+        *(f"wrote {path}" for path in written),
     ]
+    console.finish(payload, lines)
+    return 0
 
 
 def run_view(command: Command, console: Console) -> int:
@@ -172,28 +157,30 @@ def run_view(command: Command, console: Console) -> int:
     Raises:
         VPrismError: nothing to show in the input, or a robot that does not fit it.
     """
+    from vprism_plan.planning import read_trajectory
     from vprism_plan.robots import Robot
     from vprism_plan.viz.viewer import Viewer, require_viser
 
     require_viser()
     robot = None if command.robot is None else Robot.from_urdf(command.robot)
     m, plan = _map_and_plan(command.input, console)
-    trajectory = None
+    trajectory, file = None, command.input / "trajectory.json"
     if robot is not None:
-        if plan is not None:
-            trajectory = _motion(command.input, robot)
-        robot = _placed(command, robot, m, plan, console)
+        if plan is not None and file.is_file():
+            names, trajectory = read_trajectory(file)
+            if names != robot.joint_names:
+                raise PlanningError(
+                    f"{command.input} was planned for the joints {list(names)}; {robot.name} has "
+                    f"{list(robot.joint_names)}: give the robot it was planned for"
+                )
+        robot = _placed(command, robot, m, plan or {}, console)
     where = {"host": command.host, "port": command.port}
     with console.stage("scene"):
         viewer = Viewer(m, robot, trajectory, level=command.level, **where)
     try:
         shown = sorted({path.split("/")[1] for path in viewer.nodes})
-        payload = {
-            "url": viewer.url,
-            "shown": shown,
-            "nodes": sorted(viewer.nodes),
-            "timings": console.timings,
-        }
+        payload: dict[str, Any] = {"url": viewer.url, "shown": shown, "nodes": sorted(viewer.nodes)}
+        payload["timings"] = console.timings
         lines = [f"{command.input}: {', '.join(shown)}"]
         if robot is None and plan is not None:
             lines.append("give --robot URDF to see the robot and its path")
@@ -232,31 +219,12 @@ def _map_and_plan(path: Path, console: Console) -> tuple["VPrismMap", dict[str, 
     return load(saved, console), report
 
 
-def _motion(folder: Path, robot: "Robot") -> "Trajectory | None":
-    """Return the trajectory that a plan wrote, if it found a path.
-
-    Raises:
-        PlanningError: it is of other joints than the robot's.
-    """
-    from vprism_plan.planning import read_trajectory
-
-    if not (folder / "trajectory.json").is_file():
-        return None
-    names, trajectory = read_trajectory(folder / "trajectory.json")
-    if names != robot.joint_names:
-        raise PlanningError(
-            f"{folder} was planned for the joints {list(names)}; {robot.name} has "
-            f"{list(robot.joint_names)}: give the robot it was planned for"
-        )
-    return trajectory
-
-
 def _placed(
-    command: Command, robot: "Robot", m: "VPrismMap", plan: dict[str, Any] | None, console: Console
+    command: Command, robot: "Robot", m: "VPrismMap", plan: dict[str, Any], console: Console
 ) -> "Robot":
     """Return the robot where it is asked to stand, where it stood, or where it would stand."""
     around, xyz = Surroundings.of(m), command.base_xyz
-    if xyz is None and plan is not None and "base_pose" in plan:
+    if xyz is None and "base_pose" in plan:
         if command.base_yaw is None:
             return robot.with_base_pose(plan["base_pose"])
         xyz = plan["base_pose"][:3, 3]

@@ -23,19 +23,16 @@ if TYPE_CHECKING:
     from vprism_plan.robots import Robot
     from vprism_plan.world import World
 
+_PICTURES = ("scene.png", "map.png", "plan.png")
 PLAN_FILES = (
-    "scene.png",
-    "map.png",
-    "plan.png",
+    *_PICTURES,
     "map.safetensors",
     "meshes/object_*.ply",
     "trajectory.json",
     "report.json",
 )
+_POLICIES = ("occluded", "unobserved", "level", "resolution")  # of a world, in the report
 _PROFILE = 64  # clearances along the path in the report
-_DEMO_XYZ = (0.05, -0.6, 0.0)  # metres, beside the clutter
-_DEMO_YAW = np.pi / 2  # radians, facing it
-_DEMO_MARGIN = 0.005  # metres that every sphere keeps from all that may be occupied
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -61,10 +58,10 @@ def run_demo(command: Command, console: Console) -> int:
     with console.stage("bake"):
         world = World(m)
     around = Surroundings.of(m)
-    pose = around.base_pose(_DEMO_XYZ, _DEMO_YAW)
+    pose = around.base_pose([0.05, -0.6, 0.0], np.pi / 2)  # beside the clutter, facing it
     robot = Robot.from_urdf(urdf_path("panda"), base_pose=pose)
     with console.stage("check"):  # compiles on first use
-        checker = CollisionChecker(world, robot, CheckerConfig(margin=_DEMO_MARGIN))
+        checker = CollisionChecker(world, robot, CheckerConfig(margin=0.005))
     with console.stage("place"):
         ends = choose_ends(checker, around, np.random.default_rng(seed))
     if ends is None:
@@ -101,16 +98,11 @@ def run_plan(command: Command, console: Console) -> int:
             checker, start, goal = _place(command, robot, goal, world, config)
     except NoPlaceError as error:
         plan = {"status": "no_place", "message": str(error)}
-        console.finish(
-            {"solved": False, "plan": plan, "timings": console.timings},
-            [f"no safe answer (no_place): {error}"],
-        )
+        payload = {"solved": False, "plan": plan, "timings": console.timings}
+        console.finish(payload, [f"no safe answer (no_place): {error}"])
         return 1
-    given = {
-        "base": command.base_xyz,
-        "start": command.start,
-        "goal": command.goal or command.goal_pose,
-    }
+    given = {"base": command.base_xyz, "start": command.start}
+    given["goal"] = command.goal or command.goal_pose
     chosen = [name for name, value in given.items() if value is None]
     return solve(command, console, checker, start, goal, chosen)
 
@@ -207,7 +199,7 @@ def solve(
     options = {"planner": command.planner, "time_limit": command.time_limit, "seed": command.seed}
     with console.stage("plan"):
         result = plan(checker, start, goal, **options)
-    world, robot, path = checker.world, checker.robot, result.path
+    world, robot, path, report = checker.world, checker.robot, result.path, result.report
     with staged(command.output, PLAN_FILES) as aside:
         with console.stage("mesh"):
             meshes = write_meshes(world.map, aside / "meshes", world.config.level, 0.01)
@@ -223,14 +215,17 @@ def solve(
             "goal": goal,
             "chosen_automatically": chosen,
             "path": path,
-            "plan": _numbers(result),
+            "plan": {
+                "status": result.status,
+                "message": result.message,
+                **{field.name: getattr(report, field.name) for field in fields(report)},
+                "risk": None if report.risk is None else report.risk.to_dict(),
+                "allowed_contacts": [contact.to_dict() for contact in report.allowed_contacts],
+            },
             "explanation": None if result.explanation is None else result.explanation.text(),
             "map": describe_map(world.map),
             "world": {
-                "occluded": world.config.occluded,
-                "unobserved": world.config.unobserved,
-                "level": world.config.level,
-                "resolution": world.config.resolution,
+                **{name: getattr(world.config, name) for name in _POLICIES},
                 "nodes": list(world.field.distance.shape),
                 "margin": checker.config.margin,
                 "max_risk": checker.config.max_risk,
@@ -244,7 +239,12 @@ def solve(
             timed = time_parameterize(robot, path)
             write_trajectory(aside / "trajectory.json", robot, timed, frame_id="world")
             payload["trajectory"] = {"duration": timed.duration, "points": len(timed.times)}
-            payload["clearance"] = clearance_profile(checker, path)
+            dense = dense_path(path, 0.01)
+            clearance = checker.clearance_batch(dense)
+            shown = np.linspace(0, len(dense) - 1, min(_PROFILE, len(dense))).astype(int)
+            extremes = {"minimum": float(clearance.min()), "mean": float(clearance.mean())}
+            samples = {"samples": len(dense), "profile": clearance[shown]}
+            payload["clearance"] = extremes | samples
             if truth is not None:
                 payload["truth"] = true_distance(robot, path, truth)
         files = {p.relative_to(aside): p for p in sorted(aside.rglob("*")) if p.is_file()}
@@ -276,18 +276,6 @@ def _draw(
         save_figure(figure, folder / "plan.png")
 
 
-def _numbers(result: "PlanResult") -> dict[str, Any]:
-    """Return status, message and the report's fields, JSON-ready."""
-    report = result.report
-    return {
-        "status": result.status,
-        "message": result.message,
-        **{field.name: getattr(report, field.name) for field in fields(report)},
-        "risk": None if report.risk is None else report.risk.to_dict(),
-        "allowed_contacts": [contact.to_dict() for contact in report.allowed_contacts],
-    }
-
-
 def dense_path(path: np.ndarray, step: float) -> np.ndarray:
     """Return a path with configurations at most `step` apart in every joint, corners kept."""
     pieces = [path[:1]]
@@ -295,19 +283,6 @@ def dense_path(path: np.ndarray, step: float) -> np.ndarray:
         count = max(1, int(np.ceil(np.abs(b - a).max() / step)))
         pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
     return np.concatenate(pieces)
-
-
-def clearance_profile(checker: "CollisionChecker", path: np.ndarray) -> dict[str, Any]:
-    """Return the map's clearance along a path, metres: smallest, mean, and a profile."""
-    dense = dense_path(path, 0.01)
-    clearance = checker.clearance_batch(dense)
-    shown = np.linspace(0, len(dense) - 1, min(_PROFILE, len(dense))).astype(int)
-    return {
-        "minimum": float(clearance.min()),
-        "mean": float(clearance.mean()),
-        "samples": len(dense),
-        "profile": clearance[shown],
-    }
 
 
 def true_distance(robot: "Robot", path: np.ndarray, truth: Distance) -> dict[str, Any]:

@@ -6,7 +6,7 @@ stand behind. Here every pixel asks which surface is nearest. Layers can be laid
 each other clear: a robot's pose in between is one silhouette, not a heap of discs.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -72,17 +72,11 @@ class Film:
         return np.maximum(first, 0), np.minimum(last, np.array([self.width, self.height]) - 1)
 
 
-@dataclass(eq=False)
 class Layer:
-    """What is nearest in every pixel: distance, outward normal, colour."""
+    """What is nearest in every pixel of a film: distance, outward normal, colour."""
 
-    film: Film
-    depth: np.ndarray = field(init=False)
-    normal: np.ndarray = field(init=False)
-    color: np.ndarray = field(init=False)
-
-    def __post_init__(self) -> None:
-        shape = (self.film.height, self.film.width)
+    def __init__(self, film: Film) -> None:
+        self.film, shape = film, (film.height, film.width)
         self.depth = np.full(shape, _NOTHING, dtype=np.float32)
         self.normal = np.zeros((*shape, 3), dtype=np.float32)
         self.color = np.ones((*shape, 3), dtype=np.float32)
@@ -124,7 +118,15 @@ class Layer:
         triangles, normals = triangles[facing], normals[facing]
         # A ray r meets the plane of corners c at sum(w) = 1 with r t = C w: w / t = C^-1 r.
         inverse = np.linalg.inv(np.swapaxes(triangles - eye, 1, 2))
-        pixel, which = self._candidates(self.film.view.project(triangles))
+        # Every pixel in the box of each triangle.
+        flat = self.film.view.project(triangles)
+        low, high = self.film.boxes(flat.min(axis=1), flat.max(axis=1))
+        size = np.maximum(high - low + 1, 0)
+        count = size[:, 0] * size[:, 1]
+        which = np.repeat(np.arange(len(flat)), count)
+        number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
+        rows, columns = np.divmod(number, size[which, 0])
+        pixel = (low[which, 1] + rows) * self.film.width + low[which, 0] + columns
         rays = self.film.rays.reshape(-1, 3)[pixel].astype(np.float64)
         weights = np.einsum("ijk,ik->ij", inverse[which], rays)
         inside = weights.min(axis=1) >= -1e-7
@@ -140,17 +142,6 @@ class Layer:
         self.depth.reshape(-1)[pixel] = t[nearest]
         self.normal.reshape(-1, 3)[pixel] = normal
         self.color.reshape(-1, 3)[pixel] = color
-
-    def _candidates(self, flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return pixels and triangles (m,), (m,): every pixel in the box of each triangle."""
-        low, high = self.film.boxes(flat.min(axis=1), flat.max(axis=1))
-        size = np.maximum(high - low + 1, 0)
-        count = size[:, 0] * size[:, 1]
-        which = np.repeat(np.arange(len(flat)), count)
-        number = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-        row = low[which, 1] + number // size[which, 0]
-        column = low[which, 0] + number % size[which, 0]
-        return row * self.film.width + column, which
 
     def shaded(self) -> np.ndarray:
         """Return the lit colours (h, w, 3) with dark lines where the depth jumps."""

@@ -58,16 +58,10 @@ def _draw_labels(axis: Axes, obs: Observation, depth: np.ndarray) -> None:
     for object_id in obs.object_ids:
         mask = obs.labels == object_id
         picture[mask] = 0.35 * picture[mask] + 0.65 * object_color(object_id)
-        rows, columns = np.nonzero(mask)
-        axis.annotate(
-            str(object_id),
-            (float(np.median(columns)), float(np.median(rows))),
-            ha="center",
-            va="center",
-            fontsize=9,
-            color="white",
-            bbox={"boxstyle": "round,pad=0.2", "fc": (0, 0, 0, 0.55), "ec": "none"},
-        )
+        row, column = (float(np.median(places)) for places in np.nonzero(mask))
+        box = {"boxstyle": "round,pad=0.2", "fc": (0, 0, 0, 0.55), "ec": "none"}
+        style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "color": "white"}
+        axis.annotate(str(object_id), (column, row), bbox=box, **style)
     axis.imshow(np.clip(picture, 0.0, 1.0), interpolation="nearest")
     axis.set_title(f"labels ({len(obs.object_ids)} objects)")
 
@@ -77,13 +71,12 @@ class Slice:
     """A plane through the world: origin + a * u + b * v for a, b in the given ranges."""
 
     title: str
+    labels: tuple[str, str]  # of a and b
     origin: np.ndarray
     u: np.ndarray
     v: np.ndarray
     a: np.ndarray
     b: np.ndarray
-    a_label: str
-    b_label: str
 
     @property
     def grid(self) -> dict[str, Any]:
@@ -149,9 +142,8 @@ def _slices(m: "VPrismMap", resolution: float) -> tuple[Slice, Slice]:
     objects = object_points(m)
     low, high = np.percentile(objects, [0.5, 99.5], axis=0)
     middle = 0.5 * (low + high)
-    normal = m.plane.normal
+    normal, top = m.plane.normal, float(high[2])
     table = float((m.plane.offset - normal[:2] @ middle[:2]) / normal[2])
-    top = float(high[2])
     sight = middle - m.views[0].camera_center
     sight[2] = 0.0
     if np.linalg.norm(sight) < 0.02:  # seen from straight above
@@ -165,34 +157,20 @@ def _slices(m: "VPrismMap", resolution: float) -> tuple[Slice, Slice]:
     )
     # What hides behind the objects is the point of the picture: room for it.
     along = np.arange(-reach, reach + 0.10, resolution)
-    height = table + 0.5 * (top - table)
-    horizontal = Slice(
-        title=f"{100 * (height - table):.0f} cm above the table, seen from above",
-        origin=middle + np.array([0.0, 0.0, height]),
-        u=sight,
-        v=left,
-        a=along,
-        b=np.arange(-aside, aside, resolution),
-        a_label="",
-        b_label="to the camera's left (m)",
-    )
-    vertical = Slice(
-        title="upright, through the middle of the objects",
-        origin=middle,
-        u=sight,
-        v=np.array([0.0, 0.0, 1.0]),
-        a=along,
-        b=np.arange(table - 0.03, top + _PAD, resolution),
-        a_label="along the line of sight (m); the camera is on the left",
-        b_label="height z (m)",
-    )
-    return horizontal, vertical
+    height, up = table + 0.5 * (top - table), np.array([0.0, 0.0, 1.0])
+    title = f"{100 * (height - table):.0f} cm above the table, seen from above"
+    labels = ("", "to the camera's left (m)")
+    across = np.arange(-aside, aside, resolution)
+    horizontal = Slice(title, labels, middle + height * up, sight, left, along, across)
+    title = "upright, through the middle of the objects"
+    labels = ("along the line of sight (m); the camera is on the left", "height z (m)")
+    upward = np.arange(table - 0.03, top + _PAD, resolution)
+    return horizontal, Slice(title, labels, middle, sight, up, along, upward)
 
 
 def occluded(views: tuple[Observation, ...], points: np.ndarray) -> np.ndarray:
     """Return where no view saw the point and at least one saw something in front of it."""
-    behind = np.zeros(len(points), dtype=bool)
-    seen = np.zeros(len(points), dtype=bool)
+    behind, seen = np.zeros((2, len(points)), dtype=bool)
     for view in views:
         local = transform_points(invert_transform(view.pose), points)
         pixels, depth = project(local, view.intrinsics)
@@ -227,9 +205,9 @@ def draw_slice(
     ):
         image = axis.imshow(values, cmap=cmap, vmin=0, vmax=top, **grid)
         figure.colorbar(image, cax=axis.inset_axes((1.02, 0.0, 0.035, 1.0)), label=label)
-        name_axes(axis, f"{name}, {plane.title}", plane.a_label, plane.b_label)
+        name_axes(axis, f"{name}, {plane.title}", *plane.labels)
         if hidden.any() and not hidden.all():
-            hatch(axis, hidden, [0.5, 1.5], "///", 0.35, grid)
+            hatch(axis, hidden, 0.5, "///", 0.35, grid)
         if support.min() <= 0 < support.max():
             known = support > 0
             axis.contour(known, levels=[0.5], colors="white", linestyles=":", linewidths=1, **grid)
@@ -244,18 +222,16 @@ def draw_slice(
             seen, labels = view.points()
             offset = seen[labels > 0] - plane.origin
             offset = offset[np.abs(offset @ np.cross(plane.u, plane.v)) < _NEAR_SLICE]
-            style = {"markersize": 1.6, "color": "#ffb000", "rasterized": True}
-            axis.plot(offset @ plane.u, offset @ plane.v, ".", **style)
+            x, y = offset @ plane.u, offset @ plane.v
+            axis.plot(x, y, ".", markersize=1.6, color="#ffb000", rasterized=True)
         if plane.v[2] > 0.5:
             axis.axhline(float(plane.b[0]) + 0.03, color="#9ad0ff", linewidth=1.0)
         axis.set_xlim(grid["extent"][:2])
         axis.set_ylim(grid["extent"][2:])
 
 
-def hatch(
-    axis: Axes, values: np.ndarray, levels: list[float], marks: str, alpha: float, grid: Any
-) -> None:
-    """Hatch in white where values lie between two levels."""
-    shade = axis.contourf(values, levels=levels, colors="none", hatches=[marks], **grid)
+def hatch(axis: Axes, values: np.ndarray, low: float, marks: str, alpha: float, grid: Any) -> None:
+    """Hatch in white where values are above a level."""
+    shade = axis.contourf(values, levels=[low, np.inf], colors="none", hatches=[marks], **grid)
     shade.set_edgecolor((1, 1, 1, alpha))
     shade.set_linewidth(0.0)

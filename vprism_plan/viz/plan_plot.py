@@ -77,9 +77,18 @@ def plan_figure(
         np.linspace(0, len(dense) - 1, ghosts + 2).astype(int)[1:-1],
     )
     points = stage.points()
-    pictures = {
-        name: _render(stage, points, view) for name, view in _views(stage, points, robot).items()
-    }
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = 0.5 * (low + high)
+    middle[2] = table_height + 0.45 * (high[2] - table_height)
+    distance = 2.2 * float(np.linalg.norm(high - low)) / 2
+    ahead = middle[:2] - robot.base_pose[:2, 3]
+    heading = float(np.arctan2(ahead[1], ahead[0]))
+    pictures = {}
+    for name, turn, rise in (("facing the robot", 0.30, 0.42), ("from above", 0.0, 1.15)):
+        angle = heading + turn
+        offset = [np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)]
+        view = View(middle + distance * np.array(offset), middle)
+        pictures[name] = _render(stage, points, view)
     shapes = [picture.shape[1] / picture.shape[0] for picture in pictures.values()]
     figure = new_figure(max(5.6 * sum(shapes) + 0.4, 8.0), 6.6, title)
     axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": shapes})
@@ -93,21 +102,6 @@ def plan_figure(
     ]
     legend(figure, entries, max(1, int(figure.get_figwidth() / 1.7)))
     return figure
-
-
-def _views(stage: _Stage, points: np.ndarray, robot: "Robot") -> dict[str, View]:
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle = 0.5 * (low + high)
-    middle[2] = stage.table + 0.45 * (high[2] - stage.table)
-    distance = 2.2 * float(np.linalg.norm(high - low)) / 2
-    ahead = middle[:2] - robot.base_pose[:2, 3]
-    heading = float(np.arctan2(ahead[1], ahead[0]))
-    views = {}
-    for name, turn, height in (("facing the robot", 0.30, 0.42), ("from above", 0.0, 1.15)):
-        angle = heading + turn
-        offset = [np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)]
-        views[name] = View(middle + distance * np.array(offset), middle)
-    return views
 
 
 def _render(stage: _Stage, points: np.ndarray, view: View) -> np.ndarray:

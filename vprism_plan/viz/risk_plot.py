@@ -15,7 +15,9 @@ from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_
 
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
+    from vprism_plan.collision.entropy import PathEntropy
     from vprism_plan.collision.margins import SafetyMargins
+    from vprism_plan.collision.reports import RiskEstimate
 
 _PAD = 0.16  # metres shown around the objects
 _POSES = 240  # configurations whose spheres are drawn
@@ -63,8 +65,8 @@ def risk_figure(
     for axis in axes[0]:
         sweep.draw(axis, plane)
     dense, places = densified(path, _SAMPLES)
-    _draw_entropy(axes[1, 0], checker, dense, places)
-    _draw_risk(axes[1, 1], checker, dense, places)
+    _draw_entropy(axes[1, 0], checker.path_entropy(dense), places)
+    _draw_risk(axes[1, 1], checker.collision_probability(dense), places)
     for axis in axes[1]:
         axis.legend(loc="upper left", fontsize=8)
         axis.set_xlim(0.0, max(float(places[-1]), 1e-9))
@@ -103,27 +105,19 @@ def densified(
 
 def _height(checker: "CollisionChecker", path: np.ndarray) -> float:
     """Height, metres, at which the path comes nearest to an object, over the table."""
-    margins = checker.safety_margin(path, tolerance=0.01).margins
-    nearest = next((m.nearest for m in margins if m.kind == "object"), None)
     plane: Any = checker.world.map.plane
     table = float(plane.offset / plane.normal[2])
+    margins = checker.safety_margin(path, tolerance=0.01).margins
+    nearest = next((m.nearest for m in margins if m.kind == "object"), None)
     return table + 0.02 if nearest is None else max(float(nearest[2]), table + 0.01)
 
 
 def _horizontal(m: Any, height: float, resolution: float) -> Slice:
     low, high = np.percentile(object_points(m)[:, :2], [0.5, 99.5], axis=0)
-    low, high = low - _PAD, high + _PAD
-    table = float(m.plane.offset / m.plane.normal[2])
-    return Slice(
-        title=f"{100 * (height - table):.1f} cm above the table",
-        origin=np.array([0.0, 0.0, height]),
-        u=np.array([1.0, 0.0, 0.0]),
-        v=np.array([0.0, 1.0, 0.0]),
-        a=np.arange(low[0], high[0], resolution),
-        b=np.arange(low[1], high[1], resolution),
-        a_label="x (m)",
-        b_label="y (m)",
-    )
+    x, y = (np.arange(a, b, resolution) for a, b in zip(low - _PAD, high + _PAD, strict=True))
+    title = f"{100 * (height - float(m.plane.offset / m.plane.normal[2])):.1f} cm above the table"
+    u, v, up = np.eye(3)
+    return Slice(title, ("x (m)", "y (m)"), height * up, u, v, x, y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +144,9 @@ class _Sweep:
 
     def draw(self, axis: Axes, plane: Slice) -> None:
         if (self.whole > 0).any():
-            hatch(axis, self.whole, [0.0, np.inf], "...", 0.55, plane.grid)
-        for depth, color, width in (
-            (self.whole, (1.0, 1.0, 1.0), 1.8),
-            (self.start, START_COLOR, 2.0),
-            (self.goal, GOAL_COLOR, 2.0),
-        ):
+            hatch(axis, self.whole, 0.0, "...", 0.55, plane.grid)
+        outlines = ((self.whole, "white"), (self.start, START_COLOR), (self.goal, GOAL_COLOR))
+        for (depth, color), width in zip(outlines, (1.8, 2.0, 2.0), strict=True):
             if depth.min() < 0 < depth.max():
                 for shade, wide in (("black", width + 1.6), ([color], width)):
                     axis.contour(depth, levels=[0.0], colors=shade, linewidths=wide, **plane.grid)
@@ -176,10 +167,7 @@ def _cut(centers: np.ndarray, radii: np.ndarray, plane: Slice) -> np.ndarray:
     return depth
 
 
-def _draw_entropy(
-    axis: Axes, checker: "CollisionChecker", dense: np.ndarray, places: np.ndarray
-) -> None:
-    entropy = checker.path_entropy(dense)
+def _draw_entropy(axis: Axes, entropy: "PathEntropy", places: np.ndarray) -> None:
     share = axis.twinx()
     supported = 100 * (1 - np.array(entropy.waypoint_unsupported))
     share.fill_between(places, 0.0, supported, color="0.87", linewidth=0)
@@ -189,17 +177,13 @@ def _draw_entropy(
     axis.patch.set_visible(False)
     axis.plot(places, entropy.waypoint_max, color=_LARGEST, label="largest of a sphere")
     axis.plot(places, entropy.waypoint_mean, color=_MEAN, label="mean over the supported volume")
-    highest = np.nan_to_num(np.array(entropy.waypoint_max)).max()
-    axis.set_ylim(0.0, max(0.1, 1.45 * float(highest)))
+    axis.set_ylim(0.0, max(0.1, 1.45 * float(np.nan_to_num(entropy.waypoint_max).max())))
     where = f"{100 * (1 - entropy.unsupported_share):.0f}% of {1000 * entropy.swept_volume:.0f} l"
     mean = "nothing supported" if np.isnan(entropy.swept_mean) else f"{entropy.swept_mean:.2f} nats"
     name_axes(axis, f"entropy along the path; swept: {mean} over {where}", _PLACE, "entropy (nats)")
 
 
-def _draw_risk(
-    axis: Axes, checker: "CollisionChecker", dense: np.ndarray, places: np.ndarray
-) -> None:
-    risk = checker.collision_probability(dense)
+def _draw_risk(axis: Axes, risk: "RiskEstimate", places: np.ndarray) -> None:
     axis.axhspan(risk.lower, risk.upper, color="0.85", linewidth=0)
     whole = "whole path, with its interval"
     axis.axhline(risk.probability, color="0.25", linestyle="--", label=whole)
@@ -291,5 +275,4 @@ def _draw_pairs(axis: Axes, margins: "SafetyMargins", links: list[str], bodies: 
         fontsize=10,
     )
     axis.tick_params(length=0)
-    for side in axis.spines.values():
-        side.set_visible(False)
+    axis.spines[:].set_visible(False)

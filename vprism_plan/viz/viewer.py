@@ -52,9 +52,7 @@ class EntropyVolume:
         mass = np.concatenate([m.support(chunk) for chunk in chunks])
         supported = mass > _SUPPORTED * mass.max()
         self.values: np.ndarray = np.where(supported, values, np.nan).reshape(grid.shape[:3])
-        self._grid = grid
-        self._top = float(np.log(m.n_classes))
-        z = self._axes[2]
+        self._grid, self._top, z = grid, float(np.log(m.n_classes)), self._axes[2]
         self.heights = float(z[0]), float(z[-1]), round(float(resolution), 4)
         self.corners = np.stack([grid[0, 0, 0], grid[-1, -1, -1]])
 
@@ -71,16 +69,13 @@ class EntropyVolume:
         layer = int(np.abs(self._axes[2] - height).argmin())
         nx, ny, _ = self.values.shape
         corner = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)).ravel()
-        one = np.stack([corner, corner + ny, corner + ny + 1], axis=1)
-        other = np.stack([corner, corner + ny + 1, corner + 1], axis=1)
-        faces = np.concatenate([one, other])
+        faces = corner[:, None] + np.array([[[0, ny, ny + 1]], [[0, ny + 1, 1]]])
+        faces = faces.reshape(-1, 3)
+        faces = np.concatenate([faces, faces[:, ::-1]])  # seen from below as well
         colors = self._colors(self.values[:, :, layer].reshape(-1))
-        return trimesh.Trimesh(
-            self._grid[:, :, layer].reshape(-1, 3),
-            np.concatenate([faces, faces[:, ::-1]]),  # seen from below as well
-            vertex_colors=np.column_stack([colors, np.full(len(colors), 255, np.uint8)]),
-            process=False,
-        )
+        colors = np.column_stack([colors, np.full(len(colors), 255, np.uint8)])
+        points = self._grid[:, :, layer].reshape(-1, 3)
+        return trimesh.Trimesh(points, faces, vertex_colors=colors, process=False)
 
     def _colors(self, nats: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
         from matplotlib import colormaps
@@ -136,19 +131,16 @@ class Viewer:
                     f"a trajectory of {joints} joints is given, but {what}; give the robot that "
                     "it was planned for"
                 )
-        self.map, self.robot, self.trajectory = m, robot, trajectory
-        self.nodes: dict[str, Any] = {}
-        self.controls: dict[str, Any] = {}
-        self._resolution = resolution
-        self._surfaces: dict[float, dict[int, Any]] = {}
-        self._lock = threading.Lock()
         require_viser()
         import viser
 
+        self.map, self.robot, self.trajectory, self._resolution = m, robot, trajectory, resolution
+        self.nodes: dict[str, Any] = {}
+        self.controls: dict[str, Any] = {}
+        self._surfaces: dict[float, dict[int, Any]] = {}
+        self._lock = threading.Lock()
         with _silence():
-            self.server = viser.ViserServer(
-                host=host, port=port, label="vprism_plan", verbose=False
-            )
+            self.server = viser.ViserServer(host, port, label="vprism_plan", verbose=False)
         try:
             self._fill(level)
         except BaseException:
@@ -223,31 +215,24 @@ class Viewer:
         middle = 0.5 * self._volume.corners.sum(axis=0)
         plane = self.map.plane
         table = float((plane.offset - plane.normal[:2] @ middle[:2]) / plane.normal[2])
-        scene.add_grid(
-            "/table",
-            width=2.0,
-            height=2.0,
-            cell_size=0.1,
-            section_size=0.5,
-            position=(*middle[:2], table),
-            plane_color=(235, 232, 225),
-            plane_opacity=0.8,
-        )
+        size: dict[str, Any] = {"width": 2.0, "height": 2.0, "cell_size": 0.1, "section_size": 0.5}
+        style: dict[str, Any] = {"plane_color": (235, 232, 225), "plane_opacity": 0.8}
+        scene.add_grid("/table", position=(*middle[:2], table), **size, **style)
         self._add_views()
         with gui.add_folder("map"):
             self._box("objects", True, "/objects/")
-            text = "level: P(occupied)"
-            self._slider("level", text, 0.05, 0.95, 0.05, round(level, 2), self.show_level)
+            bounds = (0.05, 0.95, 0.05, round(level, 2))
+            self._slider("level", "level: P(occupied)", self.show_level, *bounds)
             self._box("observed points", False, "/points/")
             self._box("cameras", False, "/cameras/")
         with gui.add_folder("entropy"):
             top = float(np.log(self.map.n_classes))
             bounds = (0.0, round(top, 2), 0.01, round(0.3 * top, 2))
             self._box("entropy cloud", True, "/entropy/cloud")
-            self._slider("entropy", "entropy at least (nats)", *bounds, self.show_entropy)
+            self._slider("entropy", "entropy at least (nats)", self.show_entropy, *bounds)
             self._box("entropy slice", False, "/entropy/slice")
             bounds = (*self._volume.heights, round(float(middle[2]), 3))
-            self._slider("height", "height of the slice (m)", *bounds, self.show_slice)
+            self._slider("height", "height of the slice (m)", self.show_slice, *bounds)
         self.show_level(self.controls["level"].value)
         self.show_entropy(self.controls["entropy"].value)
         self.show_slice(self.controls["height"].value)
@@ -261,14 +246,9 @@ class Viewer:
         seen = [view.points() for view in self.map.views]
         for object_id in self.map.object_ids:
             points = np.concatenate([p[labels == object_id] for p, labels in seen])
-            self._add(
-                "point_cloud",
-                f"/points/{object_id}",
-                points[:: max(1, len(points) // _POINTS)].astype(np.float32),
-                _bytes(0.6 * object_color(object_id)),
-                point_size=0.002,
-                visible=False,
-            )
+            points = points[:: max(1, len(points) // _POINTS)].astype(np.float32)
+            color, path = _bytes(0.6 * object_color(object_id)), f"/points/{object_id}"
+            self._add("point_cloud", path, points, color, point_size=0.002, visible=False)
         for number, view in enumerate(self.map.views):
             height, width = view.shape
             self._add(
@@ -318,7 +298,7 @@ class Viewer:
 
         for i, name in enumerate(robot.joint_names):
             low, high = float(robot.lower[i]), float(robot.upper[i])
-            self._slider(name, name, low, high, 0.001, float(robot.neutral[i]), follow)
+            self._slider(name, name, follow, low, high, 0.001, float(robot.neutral[i]))
         self.place_robot(robot.neutral)
 
     def _add_motion(self, robot: "Robot", trajectory: "Trajectory") -> None:
@@ -331,8 +311,7 @@ class Viewer:
         def follow(time: float) -> None:
             self.place_robot(trajectory.sample(np.array([time]))[0][0])
 
-        end = max(trajectory.duration, 0.01)
-        self._slider("time", "time (s)", 0.0, end, 0.01, 0.0, follow)
+        self._slider("time", "time (s)", follow, 0.0, max(trajectory.duration, 0.01), 0.01, 0.0)
         follow(0.0)
 
     def _add(self, kind: str, path: str, *content: Any, **style: Any) -> None:
@@ -343,16 +322,10 @@ class Viewer:
             self.nodes.pop(path).remove()
 
     def _slider(
-        self,
-        name: str,
-        text: str,
-        low: float,
-        high: float,
-        step: float,
-        value: float,
-        changed: Callable[[float], None],
+        self, name: str, text: str, changed: Callable[[float], None], *bounds: float
     ) -> None:
-        slider = self.server.gui.add_slider(text, low, high, step, value)
+        """Bounds: lowest and highest value, step, value to begin with."""
+        slider = self.server.gui.add_slider(text, *bounds)
         slider.on_update(lambda event: changed(float(slider.value)))
         self.controls[name] = slider
 
