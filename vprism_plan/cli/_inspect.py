@@ -157,7 +157,6 @@ def run_view(command: Command, console: Console) -> int:
     Raises:
         VPrismError: nothing to show in the input, or a robot that does not fit it.
     """
-    from vprism_plan.planning import read_trajectory
     from vprism_plan.robots import Robot
     from vprism_plan.viz.viewer import Viewer, require_viser
 
@@ -167,6 +166,8 @@ def run_view(command: Command, console: Console) -> int:
     trajectory, file = None, command.input / "trajectory.json"
     if robot is not None:
         if plan is not None and file.is_file():
+            from vprism_plan.planning import read_trajectory
+
             names, trajectory = read_trajectory(file)
             if names != robot.joint_names:
                 raise PlanningError(

@@ -13,15 +13,17 @@ from vprism_plan.errors import ObservationError
 
 if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
-    from vprism_plan.perception import Observation
 
 
-def observe(path: Path, frame: int | None, seed: int, console: Console) -> "Observation":
-    """Load a view; segment it if it has no labels, align it if it has no pose.
+def fit_view(
+    path: Path, seed: int, console: Console, frame: int | None = None, preset: str = "default"
+) -> "VPrismMap":
+    """Fit a map to a view; segment it if it has no labels, align it if it has no pose.
 
     Raises:
         ObservationError: the view cannot be used, or shows no object.
     """
+    from vprism_plan.mapping import MapConfig, fit_map
     from vprism_plan.perception import align_to_table, load_observation, segment_tabletop
 
     with console.stage("load"):
@@ -33,22 +35,13 @@ def observe(path: Path, frame: int | None, seed: int, console: Console) -> "Obse
     if not obs.posed:
         with console.stage("align"):
             obs = align_to_table(obs, seed=seed)
-    return obs
-
-
-def fit(obs: "Observation", seed: int, console: Console, preset: str = "default") -> "VPrismMap":
-    """Fit a map with the default or the paper's settings."""
-    from vprism_plan.mapping import MapConfig, fit_map
-
-    config = MapConfig.paper() if preset == "paper" else MapConfig()
     with console.stage("fit"):
-        m = fit_map(obs, config, seed=seed)
+        m = fit_map(obs, MapConfig.paper() if preset == "paper" else MapConfig(), seed=seed)
     console.warn(m.warnings)
     return m
 
 
 def load(path: Path, console: Console) -> "VPrismMap":
-    """Load a map."""
     from vprism_plan.mapping import load_map
 
     with console.stage("load"):
@@ -78,8 +71,7 @@ def run_map(command: Command, console: Console) -> int:
     output = command.output
     if output.is_dir():
         raise ObservationError(f"{output} is a folder; --output must name a file")
-    obs = observe(command.input, command.frame, command.seed, console)
-    m = fit(obs, command.seed, console, command.preset)
+    m = fit_view(command.input, command.seed, console, command.frame, command.preset)
     with console.stage("save"), replacing(output) as temporary:
         m.save(temporary)
     size, segmented = output.stat().st_size, "segment" in console.timings

@@ -143,14 +143,9 @@ def choose_ends(
         return 1.0 if (at - middle) @ leftward > 0 else -1.0
 
     def reach(sign: float, like: np.ndarray) -> np.ndarray | None:
-        edge = around.half_width(leftward[:2])
-        return _reach_for(
-            checker,
-            left if sign > 0 else right,
-            lambda hand: sign * ((hand - middle) @ leftward) > edge,
-            like,
-            rng,
-        )
+        target, edge = left if sign > 0 else right, around.half_width(leftward[:2])
+        outward = sign * leftward
+        return _reach_for(checker, target, lambda p: (p - middle) @ outward > edge, like, rng)
 
     first = None if start is None else np.asarray(start, dtype=np.float64)
     last = None if goal is None else np.asarray(goal, dtype=np.float64)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vprism_plan._resources import data_path, urdf_path
 from vprism_plan.cli._console import Console, dump_json, staged
-from vprism_plan.cli._maps import describe_map, fit, load, observe, write_meshes
+from vprism_plan.cli._maps import describe_map, fit_view, load, write_meshes
 from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import Surroundings, choose_ends, places
 from vprism_plan.errors import PlanningError
@@ -24,21 +24,12 @@ if TYPE_CHECKING:
     from vprism_plan.world import World
 
 _PICTURES = ("scene.png", "map.png", "plan.png")
-PLAN_FILES = (
-    *_PICTURES,
-    "map.safetensors",
-    "meshes/object_*.ply",
-    "trajectory.json",
-    "report.json",
-)
+_DATA = ("map.safetensors", "meshes/object_*.ply", "trajectory.json", "report.json")
+PLAN_FILES = (*_PICTURES, *_DATA)
 _POLICIES = ("occluded", "unobserved", "level", "resolution")  # of a world, in the report
 _PROFILE = 64  # clearances along the path in the report
 
 Distance = Callable[[np.ndarray], np.ndarray]
-
-
-class NoPlaceError(Exception):
-    """Nothing sensible was found for what the user left open: an answer, not bad input."""
 
 
 def run_demo(command: Command, console: Console) -> int:
@@ -54,7 +45,7 @@ def run_demo(command: Command, console: Console) -> int:
     from vprism_plan.world import World
 
     folder, seed = data_path("demo_scene"), command.seed
-    m = fit(observe(folder, None, seed, console), seed, console)
+    m = fit_view(folder, seed, console)
     with console.stage("bake"):
         world = World(m)
     around = Surroundings.of(m)
@@ -66,14 +57,14 @@ def run_demo(command: Command, console: Console) -> int:
         ends = choose_ends(checker, around, np.random.default_rng(seed))
     if ends is None:
         raise PlanningError(f"seed {seed} finds no start and goal for the demo; try another seed")
-    # Left of the arm is the camera's side: it starts where everything is seen.
-    goal, start = ends
     truth = load_ground_truth(folder).signed_distance
-    return solve(command, console, checker, start, goal, ["start", "goal"], truth=truth)
+    # Left of the arm is the camera's side: it starts where everything is seen.
+    return solve(command, console, checker, ends[::-1], ["start", "goal"], truth)
 
 
 def run_plan(command: Command, console: Console) -> int:
     """Plan and write the results; exit code 0, or 1 without a verified path."""
+    from vprism_plan.collision import CollisionChecker
     from vprism_plan.planning.planners import planner_kind
     from vprism_plan.robots import Robot
 
@@ -90,21 +81,30 @@ def run_plan(command: Command, console: Console) -> int:
     if command.input.suffix == ".safetensors":
         m = load(command.input, console)
     else:
-        obs = observe(command.input, command.frame, command.seed, console)
-        m = fit(obs, command.seed, console)
+        m = fit_view(command.input, command.seed, console, command.frame)
     world = bake(m, command, console)
-    try:
-        with console.stage("place"):
-            checker, start, goal = _place(command, robot, goal, world, config)
-    except NoPlaceError as error:
-        plan = {"status": "no_place", "message": str(error)}
+    around, ends = Surroundings.of(m), None
+    with console.stage("place"):
+        for number, placed in places(command, robot, world, around):
+            checker = CollisionChecker(world, placed, config)
+            rng = np.random.default_rng([command.seed, number])
+            ends = choose_ends(checker, around, rng, start=command.start, goal=goal)
+            if ends is not None:
+                break
+    if ends is None:
+        where = "any base beside them" if command.base_xyz is None else "the given base"
+        message = (
+            f"the hand has no valid configuration on both sides of the objects from {where}; "
+            "give --base-xyz, --start and --goal"
+        )
+        plan = {"status": "no_place", "message": message}
         payload = {"solved": False, "plan": plan, "timings": console.timings}
-        console.finish(payload, [f"no safe answer (no_place): {error}"])
+        console.finish(payload, [f"no safe answer (no_place): {message}"])
         return 1
     given = {"base": command.base_xyz, "start": command.start}
     given["goal"] = command.goal or command.goal_pose
     chosen = [name for name, value in given.items() if value is None]
-    return solve(command, console, checker, start, goal, chosen)
+    return solve(command, console, checker, ends, chosen)
 
 
 def bake(m: "VPrismMap", command: Command, console: Console) -> "World":
@@ -156,36 +156,11 @@ def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
     return matrix
 
 
-def _place(
-    command: Command, robot: "Robot", goal: Any, world: "World", config: "CheckerConfig"
-) -> tuple["CollisionChecker", np.ndarray, np.ndarray]:
-    """Return checker, start and goal; what is open is chosen so that it is valid.
-
-    Raises:
-        NoPlaceError: no valid start and goal on both sides of the objects.
-    """
-    from vprism_plan.collision import CollisionChecker
-
-    around = Surroundings.of(world.map)
-    for number, placed in places(command, robot, world, around):
-        checker = CollisionChecker(world, placed, config)
-        rng = np.random.default_rng([command.seed, number])
-        ends = choose_ends(checker, around, rng, start=command.start, goal=goal)
-        if ends is not None:
-            return checker, *ends
-    where = "from the given base" if command.base_xyz is not None else "from any base beside them"
-    raise NoPlaceError(
-        f"the hand has no valid configuration on both sides of the objects {where}; "
-        "give --base-xyz, --start and --goal"
-    )
-
-
 def solve(
     command: Command,
     console: Console,
     checker: "CollisionChecker",
-    start: np.ndarray,
-    goal: np.ndarray,
+    ends: tuple[np.ndarray, np.ndarray],
     chosen: list[str],
     truth: Distance | None = None,
 ) -> int:
@@ -198,7 +173,7 @@ def solve(
 
     options = {"planner": command.planner, "time_limit": command.time_limit, "seed": command.seed}
     with console.stage("plan"):
-        result = plan(checker, start, goal, **options)
+        result = plan(checker, *ends, **options)
     world, robot, path, report = checker.world, checker.robot, result.path, result.report
     with staged(command.output, PLAN_FILES) as aside:
         with console.stage("mesh"):
@@ -211,8 +186,8 @@ def solve(
             "robot": robot.name,
             "joint_names": list(robot.joint_names),
             "base_pose": robot.base_pose,
-            "start": start,
-            "goal": goal,
+            "start": ends[0],
+            "goal": ends[1],
             "chosen_automatically": chosen,
             "path": path,
             "plan": {

@@ -226,8 +226,7 @@ def draw_slice(
             axis.plot(x, y, ".", markersize=1.6, color="#ffb000", rasterized=True)
         if plane.v[2] > 0.5:
             axis.axhline(float(plane.b[0]) + 0.03, color="#9ad0ff", linewidth=1.0)
-        axis.set_xlim(grid["extent"][:2])
-        axis.set_ylim(grid["extent"][2:])
+        axis.axis(grid["extent"])
 
 
 def hatch(axis: Axes, values: np.ndarray, low: float, marks: str, alpha: float, grid: Any) -> None:

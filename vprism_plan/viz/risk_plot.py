@@ -152,8 +152,6 @@ class _Sweep:
                     axis.contour(depth, levels=[0.0], colors=shade, linewidths=wide, **plane.grid)
         axis.plot(*self.hand.T, color="white", linewidth=3.6)
         axis.plot(*self.hand.T, color=HAND_COLOR, linewidth=2.0)
-        axis.set_xlim(plane.grid["extent"][:2])
-        axis.set_ylim(plane.grid["extent"][2:])
 
 
 def _cut(centers: np.ndarray, radii: np.ndarray, plane: Slice) -> np.ndarray:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the optimiser did: where the hand went before and after, and how the costs fell."""
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -71,21 +72,16 @@ def trajopt_figure(
     figure = new_figure(12.6, tall + 4.4, title)
     axes = figure.subplots(2, 2, gridspec_kw={"height_ratios": [tall, 3.0]})
     first, last = hands[len(begun)][0][[0, -1]]
-    for axis, (a, b), name in (
-        (axes[0, 0], (0, 1), "from above"),
-        (axes[0, 1], (side, 2), "from the side"),
-    ):
+    views = ((0, 1, "from above"), (side, 2, "from the side"))
+    for axis, (a, b, name) in zip(axes[0], views, strict=True):
         _draw_world(axis, world, a, b)
         for hand, style in hands:
             axis.plot(hand[:, a], hand[:, b], **style)
         for end, color in ((first, START_COLOR), (last, GOAL_COLOR)):
             axis.plot(end[a], end[b], "o", color=color, markersize=8, zorder=5)
-        axis.set_xlim(low[a], high[a])
-        axis.set_ylim(low[b], high[b])
-        axis.set_aspect("equal")
+        axis.set(xlim=(low[a], high[a]), ylim=(low[b], high[b]), aspect="equal")
         name_axes(axis, f"path of the hand, {name}", f"{'xyz'[a]} (m)", f"{'xyz'[b]} (m)")
-    _draw_terms(axes[1, 0], result, history)
-    _draw_seeds(axes[1, 1], result, history)
+    _draw_costs(axes[1, 0], axes[1, 1], result, history)
     entries += [
         line("start", marker="o", linestyle="", color=START_COLOR),
         line("goal", marker="o", linestyle="", color=GOAL_COLOR),
@@ -130,36 +126,24 @@ def _shade(object_id: int) -> np.ndarray:
     return 0.35 + 0.65 * object_color(object_id)
 
 
-def _draw_terms(axis: Axes, result: "OptimizeResult", history: Any) -> None:
-    """Of the winner, or of the seed of least cost."""
-    seeds = result.report.seeds
-    seed = result.report.winner
-    if seed is None:
-        seed = int(np.argmin([s.cost for s in seeds]))
+def _draw_costs(left: Axes, right: Axes, result: "OptimizeResult", history: Any) -> None:
+    """The terms of the winner, or of the seed of least cost; the cost of each seed."""
+    seeds, winner = result.report.seeds, result.report.winner
+    shown = int(np.argmin([seed.cost for seed in seeds])) if winner is None else winner
     rows = np.arange(1, len(history.cost) + 1)
-    axis.plot(rows, history.cost[:, seed], color="0.75", linewidth=4.0, label="sum")
-    terms = np.stack([values[:, seed] for values in history.terms.values()])
-    for number, (name, values) in enumerate(zip(history.terms, terms, strict=True)):
-        shown = np.where(values > 0.0, values, np.nan)
-        axis.plot(rows, shown, color=_TERMS[number % len(_TERMS)], label=name)
-    _finish(axis, history, terms, f"terms of seed {seed} ({seeds[seed].name})")
-
-
-def _draw_seeds(axis: Axes, result: "OptimizeResult", history: Any) -> None:
-    rows = np.arange(1, len(history.cost) + 1)
-    seeds = result.report.seeds
+    left.plot(rows, history.cost[:, shown], color="0.75", linewidth=4.0, label="sum")
+    terms = np.stack([values[:, shown] for values in history.terms.values()])
+    for name, values, color in zip(history.terms, terms, cycle(_TERMS), strict=False):
+        left.plot(rows, np.where(values > 0.0, values, np.nan), color=color, label=name)
+    _finish(left, history, terms, f"terms of seed {shown} ({seeds[shown].name})")
     for number, seed in enumerate(seeds):
-        own = number == result.report.winner
-        axis.plot(
-            rows,
-            history.cost[:, number],
-            color=HAND_COLOR if own else PALETTE[number % len(PALETTE)],
-            linewidth=2.6 if own else 1.2,
-            linestyle="--" if seed.refused else "-",
-            label=f"{seed.name}{' (returned)' if own else ' (refused)' if seed.refused else ''}",
-            zorder=3 if own else 2,
-        )
-    _finish(axis, history, history.cost, "cost of each seed", columns=1 + (len(seeds) > 6))
+        style = {"color": PALETTE[number % len(PALETTE)], "linewidth": 1.2, "zorder": 2}
+        if number == winner:
+            style = {"color": HAND_COLOR, "linewidth": 2.6, "zorder": 3}
+        note = " (returned)" if number == winner else " (refused)" if seed.refused else ""
+        style |= {"linestyle": "--" if seed.refused else "-", "label": f"{seed.name}{note}"}
+        right.plot(rows, history.cost[:, number], **style)
+    _finish(right, history, history.cost, "cost of each seed", columns=1 + (len(seeds) > 6))
 
 
 def _finish(axis: Axes, history: Any, shown: np.ndarray, name: str, columns: int = 1) -> None:

@@ -170,31 +170,27 @@ class Viewer:
         with self._lock:
             if level not in self._surfaces:
                 self._surfaces[level] = extract_meshes(self.map, level, self._resolution)
-            self._remove("/objects/")
+            style = self._cleared("/objects/", "objects") | {"side": "double"}
             for object_id, mesh in self._surfaces[level].items():
-                style = {"color": _bytes(object_color(object_id)), "side": "double"}
-                shown = self.controls["objects"].value
-                path = f"/objects/{object_id}"
-                self._add("mesh_simple", path, *_arrays(mesh), visible=shown, **style)
+                color, path = _bytes(object_color(object_id)), f"/objects/{object_id}"
+                self._add("mesh_simple", path, *_arrays(mesh), color=color, **style)
 
     def show_entropy(self, at_least: float) -> None:
         """Draw the points that the map supports and whose entropy (nats) is at least this."""
         points, colors = self._volume.cloud(float(at_least))
         with self._lock:
-            self._remove("/entropy/cloud")
+            style = self._cleared("/entropy/cloud", "entropy cloud") | {"point_shape": "circle"}
             if len(points):
-                style = {"point_size": 0.35 * self._resolution, "point_shape": "circle"}
-                shown = self.controls["entropy cloud"].value
-                self._add("point_cloud", "/entropy/cloud", points, colors, visible=shown, **style)
+                style["point_size"] = 0.35 * self._resolution
+                self._add("point_cloud", "/entropy/cloud", points, colors, **style)
 
     def show_slice(self, height: float) -> None:
         """Draw the entropy on the horizontal slice nearest to a height (m, world)."""
         mesh = self._volume.slice(float(height))
         with self._lock:
-            self._remove("/entropy/slice")
-            style = {"cast_shadow": False, "receive_shadow": False}
-            shown = self.controls["entropy slice"].value
-            self._add("mesh_trimesh", "/entropy/slice", mesh, visible=shown, **style)
+            style = self._cleared("/entropy/slice", "entropy slice")
+            style |= {"cast_shadow": False, "receive_shadow": False}
+            self._add("mesh_trimesh", "/entropy/slice", mesh, **style)
 
     def place_robot(self, q: Float[np.ndarray, "dof"]) -> None:
         """Move the robot to a configuration."""
@@ -287,19 +283,18 @@ class Viewer:
             self._box("spheres", True, "/robot/spheres")
             if self._solids:
                 self._box("solids", False, "/robot/solids/")
-            if self.trajectory is None:
-                self._add_joints(robot)
-            else:
+            if self.trajectory is not None:
                 self._add_motion(robot, self.trajectory)
+                return
+            bounds = np.stack([robot.lower, robot.upper, robot.neutral], axis=1).tolist()
+            for name, (low, high, value) in zip(robot.joint_names, bounds, strict=True):
+                self._slider(name, name, self._follow_joints, low, high, 0.001, value)
+            self.place_robot(robot.neutral)
 
-    def _add_joints(self, robot: "Robot") -> None:
-        def follow(_: float) -> None:
-            self.place_robot(np.array([self.controls[name].value for name in robot.joint_names]))
-
-        for i, name in enumerate(robot.joint_names):
-            low, high = float(robot.lower[i]), float(robot.upper[i])
-            self._slider(name, name, follow, low, high, 0.001, float(robot.neutral[i]))
-        self.place_robot(robot.neutral)
+    def _follow_joints(self, _: float) -> None:
+        assert self.robot is not None
+        names = self.robot.joint_names
+        self.place_robot(np.array([self.controls[name].value for name in names]))
 
     def _add_motion(self, robot: "Robot", trajectory: "Trajectory") -> None:
         times = np.linspace(0.0, trajectory.duration, _POSES)
@@ -317,9 +312,11 @@ class Viewer:
     def _add(self, kind: str, path: str, *content: Any, **style: Any) -> None:
         self.nodes[path] = getattr(self.server.scene, f"add_{kind}")(path, *content, **style)
 
-    def _remove(self, prefix: str) -> None:
+    def _cleared(self, prefix: str, box: str) -> dict[str, Any]:
+        """Remove nodes; return whether those that take their place are visible, as a style."""
         for path in [path for path in self.nodes if path.startswith(prefix)]:
             self.nodes.pop(path).remove()
+        return {"visible": self.controls[box].value}
 
     def _slider(
         self, name: str, text: str, changed: Callable[[float], None], *bounds: float
@@ -355,7 +352,7 @@ def _quaternion(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:
     """The rotation of a pose, scalar first."""
     from scipy.spatial.transform import Rotation
 
-    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]])
+    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
 
 
 def require_viser() -> None:
