@@ -8,12 +8,10 @@ import pytest
 
 import vprism_plan as vp
 from vprism_plan.cli import main
-from vprism_plan.cli._console import Console, dump_json
-from vprism_plan.cli._motions import pose_matrix
-from vprism_plan.cli._outcome import dense_path, true_distance
+from vprism_plan.cli._console import Console, dump_json, staged
 from vprism_plan.cli._parsing import UsageError, parse
 from vprism_plan.cli._placing import Surroundings, candidate_bases
-from vprism_plan.cli._staging import PLAN_FILES, staged
+from vprism_plan.cli._plans import PLAN_FILES, dense_path, pose_matrix, true_distance
 from vprism_plan.errors import PlanningError, VPrismError
 
 
@@ -101,7 +99,7 @@ def test_an_interrupt_is_not_an_answer(monkeypatch, capsys, tmp_path):
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_maps, "observe", interrupted)
+    monkeypatch.setattr(_maps, "fit_view", interrupted)
     assert main(["map", "x.npz", "--output", str(tmp_path / "m.safetensors")]) == 130
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
@@ -113,7 +111,7 @@ def test_a_defect_is_neither_an_answer_nor_bad_input(monkeypatch, capsys):
     def broken(*_args, **_kwargs):
         raise AssertionError("defect")
 
-    monkeypatch.setattr(_maps, "observe", broken)
+    monkeypatch.setattr(_maps, "fit_view", broken)
     assert main(["map", "x.npz"]) == 3
     assert "Traceback" in capsys.readouterr().err
 
@@ -145,7 +143,7 @@ def test_compilation_is_noticed_and_timed():
         assert outer(3) == 8
     assert console.compiled == 1  # the inner one is part of the outer one
     assert 0 < console.compile_seconds <= console.timings["work"]
-    assert "first use" in console.compile_note()
+    assert "first use" in console.time_line()
     with console.stage("again"):
         outer(4)
     assert console.compiled == 1

@@ -18,7 +18,7 @@ def test_a_verified_path_around_real_objects(
     frame, real_frames, repository, tmp_path, capsys, monkeypatch
 ):
     if frame != FRAMES[0]:  # one set of pictures is drawn; a third of the time goes into them
-        monkeypatch.setattr("vprism_plan.cli._outcome._draw", lambda *_: None)
+        monkeypatch.setattr("vprism_plan.cli._plans._draw", lambda *_: None)
     path = next(f for f in real_frames if f.name == f"frame{frame}-depth.png")
     urdf = repository / "urdf" / "panda.urdf"
     output = tmp_path / "out"

@@ -9,9 +9,8 @@ from PIL import Image
 import vprism_plan as vp
 from vprism_plan.collision.margins import margin_profile
 from vprism_plan.viz import margin_figure, risk_figure, save_figure
-from vprism_plan.viz.margin_plot import body_style
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR
-from vprism_plan.viz.risk_plot import _cut, _horizontal, _Sweep, densified
+from vprism_plan.viz.risk_plot import _cut, _horizontal, _Sweep, body_style, densified
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ import vprism_plan as vp
 from vprism_plan.cli import main
 from vprism_plan.errors import ConfigError, MissingDependencyError
 from vprism_plan.simulation import Box, Camera, Scene, render
-from vprism_plan.viz._viewer_parts import EntropyVolume, place_solids, robot_solids
+from vprism_plan.viz.robot_plot import link_meshes
+from vprism_plan.viz.viewer import EntropyVolume
 
 viser = pytest.importorskip("viser", reason="viser is not installed (extra `viewer`)")
 
@@ -112,23 +113,25 @@ def test_entropy_is_drawn_where_it_is(small_map):
     assert np.corrcoef(colors[known].sum(axis=1), entropy[known])[0, 1] > 0.9
 
 
-def test_solids_move_with_their_links(arm):
+def test_solids_move_with_their_links(shown, arm):
     from scipy.spatial.transform import Rotation
 
-    solids = robot_solids(arm)
-    assert {s.link for s in solids.values()} == set(arm.geometry)
     q = np.array([0.3, -0.7, 1.1])
-    poses = arm.link_poses(q)
-    for name, (wxyz, position) in place_solids(arm, solids, q).items():
-        solid = solids[name]
+    shown.place_robot(q)
+    solids = {(link, number): mesh for link, number, mesh in link_meshes({}, arm.geometry)}
+    assert {link for link, _ in solids} == set(arm.geometry)
+    for (link, number), mesh in solids.items():
+        node, T = shown.nodes[f"/robot/solids/{link}/{number}"], arm.link_poses(q)[link]
+        np.testing.assert_allclose(node.vertices, mesh.vertices, atol=1e-6)
         corner = np.array([0.1, 0.2, 0.3])
-        placed = Rotation.from_quat(wxyz[[1, 2, 3, 0]]).apply(corner) + position
-        T = poses[solid.link] @ solid.T_link
-        np.testing.assert_allclose(placed, T[:3, :3] @ corner + T[:3, 3], atol=1e-12)
+        turned = Rotation.from_quat(node.wxyz, scalar_first=True).apply(corner)
+        np.testing.assert_allclose(turned + node.position, T[:3, :3] @ corner + T[:3, 3], atol=1e-6)
 
 
-def test_meshes_are_shown_where_their_links_are(tmp_path):
+def test_meshes_are_shown_where_their_links_are(small_map, tmp_path):
     import trimesh
+
+    from vprism_plan.viz.viewer import Viewer
 
     corners = trimesh.creation.box((0.1, 0.2, 0.3))
     corners.export(tmp_path / "part.stl")
@@ -137,14 +140,17 @@ def test_meshes_are_shown_where_their_links_are(tmp_path):
       </link><joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>
       <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="1" effort="1"/></joint></robot>""")
     robot = vp.Robot.from_urdf(tmp_path / "robot.urdf")
-    (name, solid), *rest = robot_solids(robot).items()
-    assert (name, rest) == ("/robot/solids/arm/mesh0", [])
-    np.testing.assert_allclose(
-        solid.mesh.bounds, [[-0.05, -0.1, 0.35], [0.05, 0.1, 0.65]], atol=1e-6
-    )
-    wxyz, position = place_solids(robot, {name: solid}, np.array([np.pi / 2]))[name]
-    np.testing.assert_allclose(wxyz, [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], atol=1e-12)
-    np.testing.assert_allclose(position, 0.0, atol=1e-12)
+    viewer = Viewer(small_map, robot, resolution=0.03, port=0)
+    try:
+        (node,) = (n for path, n in viewer.nodes.items() if path.startswith("/robot/solids/"))
+        assert node is viewer.nodes["/robot/solids/arm/mesh0"]
+        low, high = node.vertices.min(axis=0), node.vertices.max(axis=0)
+        np.testing.assert_allclose([low, high], [[-0.05, -0.1, 0.35], [0.05, 0.1, 0.65]], atol=1e-6)
+        viewer.place_robot(np.array([np.pi / 2]))
+        np.testing.assert_allclose(node.wxyz, [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], atol=1e-6)
+        np.testing.assert_allclose(node.position, 0.0, atol=1e-6)
+    finally:
+        viewer.stop()
 
 
 def test_joints_move_by_hand_without_a_trajectory(small_map, arm):

@@ -9,17 +9,13 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING
 
 from vprism_plan.errors import VPrismError
 
-if TYPE_CHECKING:
-    from vprism_plan.cli._parsing import Command
-
 # The file of each command; there `run_COMMAND(command, console)` returns the exit code.
 _FILES = {
-    "demo": "_demo", "map": "_maps", "mesh": "_maps", "plan": "_motions", "query": "_query",
-    "view": "_view", "robot": "_robot",
+    "demo": "_plans", "map": "_maps", "mesh": "_maps", "plan": "_plans", "query": "_inspect",
+    "view": "_inspect", "robot": "_inspect",
 }  # fmt: skip
 DONE, NO_SAFE_ANSWER, BAD_INPUT, DEFECT, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -30,41 +26,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         command = parse(sys.argv[1:] if arguments is None else arguments)
-    except UsageError as error:
-        return _complain(error)
+        # Two OpenMP runtimes that spin on the same cores cost more than they bring; the
+        # kernels have their own thread pool.
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        from vprism_plan.cli._console import Console
+
+        console = Console(as_json=command.json, strict=getattr(command, "strict", False))
+        file = import_module(f"vprism_plan.cli.{_FILES[command.command]}")
+        code: int = getattr(file, f"run_{command.command}")(command, console)
+        return code
     except SystemExit:  # --help
         return DONE
-    # Two OpenMP runtimes that spin on the same cores cost more than they bring; the
-    # kernels have their own thread pool.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    try:
-        return _run(command)
+    except BrokenPipeError:  # the reader of our output left early
+        sys.stderr.close()
+        return DONE
+    except (UsageError, VPrismError, OSError) as error:
+        sys.stderr.write(f"vprism-plan: error: {' '.join(str(error).split())}\n")
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        sys.stderr.write("vprism-plan: interrupted; nothing was left half-written\n")
+        return INTERRUPTED
     except Exception:
         import traceback
 
         traceback.print_exc()
         return DEFECT
-
-
-def _run(command: "Command") -> int:
-    """Run a command; what its input or its user can cause becomes an exit code."""
-    from vprism_plan.cli._console import Console
-
-    console = Console(as_json=command.json, strict=getattr(command, "strict", False))
-    file = import_module(f"vprism_plan.cli.{_FILES[command.command]}")
-    try:
-        code: int = getattr(file, f"run_{command.command}")(command, console)
-        return code
-    except BrokenPipeError:  # the reader of our output left early
-        sys.stderr.close()
-        return DONE
-    except (VPrismError, OSError) as error:
-        return _complain(error)
-    except KeyboardInterrupt:
-        sys.stderr.write("vprism-plan: interrupted; nothing was left half-written\n")
-        return INTERRUPTED
-
-
-def _complain(error: Exception) -> int:
-    sys.stderr.write(f"vprism-plan: error: {' '.join(str(error).split())}\n")
-    return BAD_INPUT

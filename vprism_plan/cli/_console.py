@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a person sees while the work runs, and what it cost: progress on stderr, times kept."""
+"""What a command puts out: progress and times, the result, folders of files."""
 
 import json
 import math
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,66 +30,65 @@ class Console:
     """
 
     def __init__(self, *, as_json: bool = False, strict: bool = False) -> None:
-        self.as_json = as_json
-        self.strict = strict
+        self.as_json, self.strict = as_json, strict
         self.warnings: list[str] = []
         self.timings: dict[str, float] = {}
-        self.compile_seconds = 0.0
-        self.compiled = 0
-        self._status: Status | None = None
-        self._stage = ""
+        self.compile_seconds, self.compiled = 0.0, 0
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Time a block under `name` and show it while it runs."""
         began = time.perf_counter()
-        self._stage = name
-        with self._spinner(f"{name} ...") as status, self._watch_compiler():
-            self._status = status
+        spinner: Any = nullcontext()
+        if sys.stderr.isatty():
+            from rich.console import Console as RichConsole
+
+            spinner = RichConsole(stderr=True).status(f"{name} ...")
+        with spinner as status, self._watch_compiler(name, status):
             try:
                 yield
             finally:
-                self._status = None
                 self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - began
 
-    def _spinner(self, text: str) -> Any:
-        if not sys.stderr.isatty():
-            return nullcontext(None)
-        from rich.console import Console as RichConsole
-
-        return RichConsole(stderr=True).status(text)
-
     @contextmanager
-    def _watch_compiler(self) -> Iterator[None]:
-        """Count what numba compiles (not what it loads from its cache) in this block."""
+    def _watch_compiler(self, stage: str, status: "Status | None") -> Iterator[None]:
+        """Count what numba compiles (not what it loads from its cache); what is compiled inside
+        another compilation is part of it."""
         from numba.core import event
 
-        clock = _CompileClock(self)
+        console, depth, began = self, 0, 0.0
 
         class Listener(event.Listener):
             def on_start(self, event: Any) -> None:
-                clock.start(event)
+                nonlocal depth, began
+                depth += 1
+                if depth > 1:
+                    return
+                began = time.perf_counter()
+                if status is not None:
+                    dispatcher = (event.data or {}).get("dispatcher")
+                    status.update(
+                        f"{stage}: compiling {getattr(dispatcher, '__name__', 'a kernel')} (on "
+                        f"first use only, {console.compile_seconds:.0f} s so far) ..."
+                    )
 
             def on_end(self, event: Any) -> None:
-                clock.end(event)
+                nonlocal depth
+                depth -= 1
+                if depth == 0:
+                    console.compile_seconds += time.perf_counter() - began
+                    console.compiled += 1
 
         with event.install_listener("numba:compile", Listener()):
             yield
 
-    def compiling(self, kernel: str) -> None:
-        """Say which kernel is being compiled."""
-        if self._status is not None:
-            self._status.update(
-                f"{self._stage}: compiling {kernel} (on first use only, "
-                f"{self.compile_seconds:.0f} s so far) ..."
-            )
-
-    def compile_note(self) -> str:
-        """Return a phrase on compilation for the summary, empty if nothing was compiled."""
+    def time_line(self) -> str:
+        """Return the stages and their seconds as one line."""
+        stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.timings.items())
         if not self.compiled:
-            return ""
+            return stages
         return (
-            f"{self.compile_seconds:.1f} s of it compiled {self.compiled} kernels "
+            f"{stages}; {self.compile_seconds:.1f} s of it compiled {self.compiled} kernels "
             "(first use; cached now)"
         )
 
@@ -104,52 +104,62 @@ class Console:
 
     def finish(self, payload: dict[str, Any], lines: Sequence[str]) -> None:
         """Print the result and the warnings: one JSON object, or lines of text."""
-        payload = {**payload, "warnings": self.warnings}
         lines = [*(f"warning: {text}" for text in self.warnings), *lines]
-        text = dump_json(payload, indent=None) if self.as_json else "\n".join(lines) + "\n"
-        sys.stdout.write(text)
+        if self.as_json:
+            sys.stdout.write(dump_json({**payload, "warnings": self.warnings}, indent=None))
+        else:
+            sys.stdout.write("\n".join(lines) + "\n")
         sys.stdout.flush()
 
 
-class _CompileClock:
-    """Adds up compilations; those inside another count once."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._depth = 0
-        self._began = 0.0
-
-    def start(self, event: Any) -> None:
-        if self._depth == 0:
-            self._began = time.perf_counter()
-            self._console.compiling(_kernel_name(event))
-        self._depth += 1
-
-    def end(self, _: Any) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self._console.compile_seconds += time.perf_counter() - self._began
-            self._console.compiled += 1
+def dump_json(payload: dict[str, Any], indent: int | None = 1) -> str:
+    """Return strict JSON text with a final newline; NaN and infinities become null."""
+    return json.dumps(_jsonable(payload), indent=indent, allow_nan=False) + "\n"
 
 
-def _kernel_name(event: Any) -> str:
-    dispatcher = (event.data or {}).get("dispatcher")
-    return str(getattr(dispatcher, "__name__", "a kernel"))
-
-
-def jsonable(value: Any) -> Any:
-    """Return plain JSON values; NaN and infinities become null."""
+def _jsonable(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, dict):
-        return {str(k): jsonable(v) for k, v in value.items()}
+        return {str(k): _jsonable(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [jsonable(v) for v in value]
+        return [_jsonable(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
 
 
-def dump_json(payload: dict[str, Any], indent: int | None = 1) -> str:
-    """Return strict JSON text with a final newline."""
-    return json.dumps(jsonable(payload), indent=indent, allow_nan=False) + "\n"
+@contextmanager
+def staged(folder: Path, ours: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty folder beside `folder`; on success its files are renamed into it.
+
+    Files in `folder` that match `ours` and were not written again are removed: a
+    trajectory of an earlier run must not look like the answer to this one. On any
+    failure, KeyboardInterrupt included, `folder` stays as it was.
+
+    Raises:
+        VPrismError: `folder` exists and is not a folder.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise VPrismError(f"{folder} is a file; --output must name a folder")
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryDirectory(
+            prefix=f".{folder.name}-", dir=folder.parent, ignore_cleanup_errors=True
+        ) as name:
+            aside = Path(name)
+            yield aside
+            written = sorted(p.relative_to(aside) for p in aside.rglob("*") if p.is_file())
+            for pattern in ours:
+                for stale in folder.glob(pattern):
+                    if stale.relative_to(folder) not in written:
+                        stale.unlink()
+            for file in written:
+                (folder / file).parent.mkdir(parents=True, exist_ok=True)
+                (aside / file).replace(folder / file)
+    except BaseException:
+        for path in made:
+            with suppress(OSError):  # absent, or no longer empty
+                path.rmdir()
+        raise

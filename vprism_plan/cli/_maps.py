@@ -7,22 +7,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vprism_plan._files import replacing
-from vprism_plan.cli._console import Console
+from vprism_plan.cli._console import Console, staged
 from vprism_plan.cli._parsing import Command
-from vprism_plan.cli._staging import MESH_FILES, staged
 from vprism_plan.errors import ObservationError
 
 if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
-    from vprism_plan.perception import Observation
 
 
-def observe(path: Path, frame: int | None, seed: int, console: Console) -> "Observation":
-    """Load a view; segment it if it has no labels, align it if it has no pose.
+def fit_view(
+    path: Path, seed: int, console: Console, frame: int | None = None, preset: str = "default"
+) -> "VPrismMap":
+    """Fit a map to a view; segment it if it has no labels, align it if it has no pose.
 
     Raises:
         ObservationError: the view cannot be used, or shows no object.
     """
+    from vprism_plan.mapping import MapConfig, fit_map
     from vprism_plan.perception import align_to_table, load_observation, segment_tabletop
 
     with console.stage("load"):
@@ -34,18 +35,17 @@ def observe(path: Path, frame: int | None, seed: int, console: Console) -> "Obse
     if not obs.posed:
         with console.stage("align"):
             obs = align_to_table(obs, seed=seed)
-    return obs
-
-
-def fit(obs: "Observation", seed: int, console: Console, preset: str = "default") -> "VPrismMap":
-    """Fit a map with the default or the paper's settings."""
-    from vprism_plan.mapping import MapConfig, fit_map
-
-    config = MapConfig.paper() if preset == "paper" else MapConfig()
     with console.stage("fit"):
-        m = fit_map(obs, config, seed=seed)
+        m = fit_map(obs, MapConfig.paper() if preset == "paper" else MapConfig(), seed=seed)
     console.warn(m.warnings)
     return m
+
+
+def load(path: Path, console: Console) -> "VPrismMap":
+    from vprism_plan.mapping import load_map
+
+    with console.stage("load"):
+        return load_map(path)
 
 
 def describe_map(m: "VPrismMap") -> dict[str, Any]:
@@ -54,11 +54,8 @@ def describe_map(m: "VPrismMap") -> dict[str, Any]:
     objects = {}
     for object_id in m.object_ids:
         points = np.concatenate([p[labels == object_id] for p, labels in seen])
-        objects[str(object_id)] = {
-            "points": len(points),
-            "lower": points.min(axis=0),
-            "upper": points.max(axis=0),
-        }
+        lower, upper = points.min(axis=0), points.max(axis=0)
+        objects[str(object_id)] = {"points": len(points), "lower": lower, "upper": upper}
     return {
         "objects": objects,
         "hinge_points": len(m.hinge_points),
@@ -71,31 +68,30 @@ def describe_map(m: "VPrismMap") -> dict[str, Any]:
 
 def run_map(command: Command, console: Console) -> int:
     """Fit and save; exit code 0."""
-    if command.output.is_dir():
-        raise ObservationError(f"{command.output} is a folder; --output must name a file")
-    obs = observe(command.input, command.frame, command.seed, console)
-    m = fit(obs, command.seed, console, command.preset)
-    with console.stage("save"), replacing(command.output) as temporary:
+    output = command.output
+    if output.is_dir():
+        raise ObservationError(f"{output} is a folder; --output must name a file")
+    m = fit_view(command.input, command.seed, console, command.frame, command.preset)
+    with console.stage("save"), replacing(output) as temporary:
         m.save(temporary)
-    size = command.output.stat().st_size
+    size, segmented = output.stat().st_size, "segment" in console.timings
     payload = {
-        "output": command.output,
+        "output": output,
         "bytes": size,
         "objects": list(m.object_ids),
         "map": describe_map(m),
-        "segmented": "segment" in console.timings,
+        "segmented": segmented,
         "aligned": "align" in console.timings,
         "seed": command.seed,
         "timings": console.timings,
         "compile_seconds": console.compile_seconds,
     }
-    ids = ", ".join(str(i) for i in m.object_ids)
-    how = " (segmented from geometry)" if payload["segmented"] else ""
+    how = " (segmented from geometry)" if segmented else ""
     lines = [
-        f"{len(m.object_ids)} objects{how}: {ids}",
+        f"{len(m.object_ids)} objects{how}: {', '.join(map(str, m.object_ids))}",
         f"{len(m.hinge_points)} hinge points, {len(m.history)} iterations",
-        time_line(console),
-        f"wrote {command.output} ({size / 1e6:.1f} MB)",
+        console.time_line(),
+        f"wrote {output} ({size / 1e6:.1f} MB)",
     ]
     console.finish(payload, lines)
     return 0
@@ -114,40 +110,23 @@ def write_meshes(m: "VPrismMap", folder: Path, level: float, resolution: float) 
 
 def run_mesh(command: Command, console: Console) -> int:
     """Write the surfaces; exit code 0, or 1 if no object reaches the level."""
-    from vprism_plan.mapping import load_map
-
-    with console.stage("load"):
-        m = load_map(command.map)
-    with staged(command.output, MESH_FILES) as aside, console.stage("mesh"):
+    m = load(command.map, console)
+    with staged(command.output, ("object_*.ply",)) as aside, console.stage("mesh"):
         meshes = write_meshes(m, aside, command.level, command.resolution)
     missing = [i for i in m.object_ids if i not in meshes]
+    objects, lines = {}, []
+    for i, mesh in meshes.items():
+        file, count, volume = command.output / f"object_{i}.ply", len(mesh.faces), mesh.volume
+        objects[str(i)] = {"file": file, "triangles": count, "volume": float(volume)}
+        lines.append(f"{file}: {count} triangles, {1e6 * float(volume):.0f} cm^3")
+    if missing:
+        lines.append(f"no surface at level {command.level:g}: objects {missing}")
     payload = {
         "output": command.output,
-        "objects": {
-            str(i): {
-                "file": command.output / f"object_{i}.ply",
-                "triangles": len(mesh.faces),
-                "volume": float(mesh.volume),
-            }
-            for i, mesh in meshes.items()
-        },
+        "objects": objects,
         "without_surface": missing,
         "timings": console.timings,
         "compile_seconds": console.compile_seconds,
     }
-    lines = [
-        f"{command.output / f'object_{i}.ply'}: {len(mesh.faces)} triangles, "
-        f"{1e6 * float(mesh.volume):.0f} cm^3"
-        for i, mesh in meshes.items()
-    ]
-    if missing:
-        lines.append(f"no surface at level {command.level:g}: objects {missing}")
     console.finish(payload, lines)
     return 0 if meshes else 1
-
-
-def time_line(console: Console) -> str:
-    """Return the stages and their seconds as one line."""
-    stages = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in console.timings.items())
-    note = console.compile_note()
-    return f"{stages}; {note}" if note else stages

@@ -26,11 +26,8 @@ class _Parser(argparse.ArgumentParser):
     """Raises instead of leaving the process, and takes -1e-3 for a number, not for an option."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
-        layout: dict[str, Any] = {
-            "formatter_class": argparse.RawDescriptionHelpFormatter,
-            "allow_abbrev": False,
-        }
-        super().__init__(*args, **(layout | options))
+        options |= {"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter}
+        super().__init__(*args, **options)
         self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 
     def error(self, message: str) -> NoReturn:
@@ -38,15 +35,11 @@ class _Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}; see {PROGRAM} --help")
 
     def take(self, what: str, kind: Any, text: str, default: Any = None, **more: Any) -> None:
-        """Add an argument.
+        """Add an argument, whose default is added to its text.
 
-        Args:
-            what: "VIEW" for one that must be there, "--level P" for an option, "--base-xyz X Y Z"
-                for one of three values, "--q Q ..." for one of any number, "--fit" for a flag.
-            kind: of its values: a type, or those to choose from.
-            text: for the help; the default is added.
-            default: if it is not given.
-            more: passed on.
+        what: "VIEW" for one that must be there, "--level P" for an option, "--base-xyz X Y Z"
+        for one of three values, "--q Q ..." for one of any number, "--fit" for a flag.
+        kind: of its values: a type, or those to choose from.
         """
         name, *values = what.split()
         if not name.startswith("--"):
@@ -60,12 +53,11 @@ class _Parser(argparse.ArgumentParser):
             text += f": {', '.join(kind)}"
         else:
             more["type"] = kind
+        more["metavar"] = values[0]
         if values[-1:] == ["..."]:
-            more |= {"nargs": "+", "metavar": values[0]}
+            more["nargs"] = "+"
         elif len(values) > 1:
             more |= {"nargs": len(values), "metavar": tuple(values)}
-        else:
-            more["metavar"] = values[0]
         if default not in (None, ()):
             text += f" ({default})"
         self.add_argument(name, default=default, help=text, **more)
@@ -94,6 +86,7 @@ def _demo(command: _Parser) -> None:
     """Fit a map of the bundled scene, plan a Panda arm across it, write pictures and results."""
     _results(command, "out/demo")
     command.take("--seed N", int, "of the fit and of the planner", 0)
+    command.set_defaults(planner="RRTConnect", time_limit=5.0)
 
 
 def _map(command: _Parser) -> None:

@@ -3,11 +3,12 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.cli._parsing import Command
 from vprism_plan.errors import PlanningError
 
 if TYPE_CHECKING:
@@ -58,42 +59,21 @@ class Surroundings:
         """Return how far the objects reach from their middle along a direction, metres."""
         return float(np.percentile(np.abs((self.points[:, :2] - self.middle) @ direction), 99.0))
 
-    def sides(self, base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
-        """Return where the hand should be right and left of the objects, seen from a base."""
-        ahead = self.middle - base[:2]
-        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-        left = np.array([-ahead[1], ahead[0]])
-        away = self.half_width(left) + _ASIDE
-        # Low enough that what stands between must be crossed, not flown over.
-        height = self.table + 0.10 + 0.2 * (float(self.points[:, 2].max()) - self.table)
-        return np.array([[*(self.middle + s * away * left), height] for s in (-1.0, 1.0)])
+    def base_pose(self, xyz: Any, yaw: float | None = None) -> Float[np.ndarray, "4 4"]:
+        """Return the pose of an upright base, which faces the objects unless yaw is given."""
+        if yaw is None:
+            ahead = self.middle - np.asarray(xyz)[:2]
+            yaw = float(np.arctan2(ahead[1], ahead[0]))
+        c, s = np.cos(yaw), np.sin(yaw)
+        pose = np.eye(4)
+        pose[:2, :2] = [[c, -s], [s, c]]
+        pose[:3, 3] = xyz
+        return pose
 
 
-def base_pose(
-    xyz: Float[np.ndarray, "3"], around: Surroundings, yaw: float | None
-) -> Float[np.ndarray, "4 4"]:
-    """Return the pose of a base that stands upright, facing the objects unless yaw is given."""
-    if yaw is None:
-        ahead = around.middle - np.asarray(xyz)[:2]
-        yaw = float(np.arctan2(ahead[1], ahead[0]))
-    c, s = np.cos(yaw), np.sin(yaw)
-    pose = np.eye(4)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = xyz
-    return pose
-
-
-def stands_free(robot: "Robot", world: "World") -> bool:
-    """Return whether the links that never move keep clear of everything but the table."""
-
-    fixed = np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
-    if not fixed.any():
-        return True
-    centers = robot.sphere_centers(robot.neutral[None])[0][fixed]
-    return bool((world.field.lower_bound(centers) > robot.sphere_radii[fixed]).all())
-
-
-def candidate_bases(robot: "Robot", around: Surroundings) -> Iterator[Float[np.ndarray, "4 4"]]:
+def candidate_bases(
+    robot: "Robot", around: Surroundings, yaw: float | None = None
+) -> Iterator[Float[np.ndarray, "4 4"]]:
     """Yield places beside the objects, most sensible first."""
     towards = around.camera[:2] - around.middle
     bearing = float(np.arctan2(towards[1], towards[0])) if np.linalg.norm(towards) > 0.05 else 0.0
@@ -104,12 +84,81 @@ def candidate_bases(robot: "Robot", around: Surroundings) -> Iterator[Float[np.n
         for share in _SHARES_OF_REACH:
             distance = max(share * reach, around.half_width(direction) + 0.2)
             xy = around.middle + distance * direction
-            yield base_pose(np.array([*xy, around.table]), around, None)
+            yield around.base_pose([*xy, around.table], yaw)
 
 
-def reach_for(
+def places(
+    command: Command, robot: "Robot", world: "World", around: Surroundings
+) -> Iterator[tuple[int, "Robot"]]:
+    """Yield the robot on the base that was given, else on the free ones of the candidates, each
+    with its number among these."""
+    if command.base_xyz is not None:
+        yield 0, robot.with_base_pose(around.base_pose(command.base_xyz, command.base_yaw))
+        return
+    fixed = np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
+    for number, pose in enumerate(candidate_bases(robot, around, command.base_yaw)):
+        placed = robot.with_base_pose(pose)
+        # The links that never move must keep clear of everything but the table.
+        centers = placed.sphere_centers(robot.neutral[None])[0][fixed]
+        if not fixed.any() or (world.field.lower_bound(centers) > robot.sphere_radii[fixed]).all():
+            yield number, placed
+
+
+def standing(command: Command, robot: "Robot", world: "World") -> "Robot":
+    """Return the robot on the base that was given, else on the first free place."""
+    for _, placed in places(command, robot, world, Surroundings.of(world.map)):
+        return placed
+    raise PlanningError("no free place for the base beside the objects; give --base-xyz")
+
+
+def choose_ends(
     checker: "CollisionChecker",
-    robot: "Robot",
+    around: Surroundings,
+    rng: np.random.Generator,
+    *,
+    start: Any = None,
+    goal: Any = None,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return start and goal; what is None is chosen on the other side of the objects.
+
+    A given start or goal is kept as it is, valid or not: that verdict is the planner's.
+    None if nothing valid was found for what is open.
+    """
+    from vprism_plan.viz import hand_path
+
+    robot = checker.robot
+    ahead = around.middle - robot.base_pose[:2, 3]
+    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    aside = np.array([-ahead[1], ahead[0]])
+    away = around.half_width(aside) + _ASIDE
+    # Low enough that what stands between must be crossed, not flown over.
+    height = around.table + 0.10 + 0.2 * (float(around.points[:, 2].max()) - around.table)
+    right, left = (np.array([*(around.middle + s * away * aside), height]) for s in (-1.0, 1.0))
+    leftward = left - right
+    leftward = leftward / np.linalg.norm(leftward)
+    middle = np.array([*around.middle, 0.0])
+
+    def side_of(end: np.ndarray) -> float:
+        at = end[:3, 3] if end.shape == (4, 4) else hand_path(robot, end[None])[0]
+        return 1.0 if (at - middle) @ leftward > 0 else -1.0
+
+    def reach(sign: float, like: np.ndarray) -> np.ndarray | None:
+        target, edge = left if sign > 0 else right, around.half_width(leftward[:2])
+        outward = sign * leftward
+        return _reach_for(checker, target, lambda p: (p - middle) @ outward > edge, like, rng)
+
+    first = None if start is None else np.asarray(start, dtype=np.float64)
+    last = None if goal is None else np.asarray(goal, dtype=np.float64)
+    if first is None:
+        like = robot.neutral if last is None or last.ndim != 1 else last
+        first = reach(-1.0 if last is None else -side_of(last), like)
+    if first is not None and last is None:
+        last = reach(-side_of(first), first)
+    return None if first is None or last is None else (first, last)
+
+
+def _reach_for(
+    checker: "CollisionChecker",
     target: Float[np.ndarray, "3"],
     beyond: Callable[[np.ndarray], np.ndarray],
     like: Float[np.ndarray, "dof"],
@@ -122,15 +171,14 @@ def reach_for(
     """
     from vprism_plan.viz import hand_path
 
+    robot = checker.robot
     span = robot.upper - robot.lower
     best = np.asarray(like)[None]
     found, score, near = None, np.inf, False
     for spread in (0.12, 0.12, 0.06, 0.03, 0.01):
         seeds = best[rng.integers(len(best), size=_SAMPLES)]
-        sample = np.clip(
-            seeds + spread * span * rng.standard_normal(seeds.shape), robot.lower, robot.upper
-        )
-        sample = np.concatenate([best, sample])
+        sample = seeds + spread * span * rng.standard_normal(seeds.shape)
+        sample = np.concatenate([best, np.clip(sample, robot.lower, robot.upper)])
         hand = hand_path(robot, sample)
         cost = np.linalg.norm(hand - target, axis=1)
         cost += _ODDNESS * np.linalg.norm(sample - like, axis=1)
@@ -141,4 +189,4 @@ def reach_for(
         if cost[order[0]] < min(score, 10.0):
             found, score = best[0], float(cost[order[0]])
             near = bool(np.linalg.norm(hand[order[0]] - target) < _ACCEPT)
-    return found if found is not None and near else None
+    return found if near else None

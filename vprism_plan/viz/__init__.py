@@ -2,12 +2,10 @@
 """What a person sees: pictures of the input, the map and the plan."""
 
 from vprism_plan.viz._figures import object_color, save_figure
-from vprism_plan.viz.map_plot import map_figure
-from vprism_plan.viz.margin_plot import margin_figure
+from vprism_plan.viz.map_plot import map_figure, scene_figure
 from vprism_plan.viz.plan_plot import hand_path, plan_figure, resample
-from vprism_plan.viz.risk_plot import risk_figure
+from vprism_plan.viz.risk_plot import margin_figure, risk_figure
 from vprism_plan.viz.robot_plot import robot_figure
-from vprism_plan.viz.scene_plot import scene_figure
 from vprism_plan.viz.trajopt_plot import trajopt_figure
 
 __all__ = [

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vprism_plan.viz._figures import new_figure, object_color
-from vprism_plan.viz._raster import Film, Layer, View, ground, halved
+from vprism_plan.viz._figures import legend, line, new_figure, object_color, show_picture
+from vprism_plan.viz._raster import Film, Layer, View, corners, ground, halved, sphere_ends
 
 if TYPE_CHECKING:
     import trimesh
@@ -41,10 +40,8 @@ class _Stage:
 
     def points(self) -> np.ndarray:
         """Return points that must be in the picture, and their shadows on the table."""
-        around = self.radii[:, None, None] * np.concatenate([np.eye(3), -np.eye(3)])
-        shown = (self.centers[[0, *self.ghosts, -1]][:, :, None] + around).reshape(-1, 3)
-        vertices = [np.asarray(mesh.vertices) for mesh in self.meshes.values()]
-        points = np.concatenate([shown, *vertices])
+        shown = sphere_ends(self.centers[[0, *self.ghosts, -1]], self.radii)
+        points = np.concatenate([shown, *(np.asarray(m.vertices) for m in self.meshes.values())])
         shadow = points.copy()
         shadow[:, 2] = self.table
         return np.concatenate([points, shadow])
@@ -79,51 +76,45 @@ def plan_figure(
         table_height,
         np.linspace(0, len(dense) - 1, ghosts + 2).astype(int)[1:-1],
     )
-    views = _views(stage, robot)
-    pictures = [_render(stage, view) for _, view in views]
-    shapes = [picture.shape[1] / picture.shape[0] for picture in pictures]
-    figure = new_figure(max(5.6 * sum(shapes) + 0.4, 8.0), 6.6)
-    if title:
-        figure.suptitle(title)
-    axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": shapes})
-    for axis, (name, _), picture in zip(axes, views, pictures, strict=True):
-        axis.imshow(picture, interpolation="antialiased")
-        axis.set_title(name, fontsize=11)
-        axis.set_axis_off()
-    _legend(figure, meshes)
-    return figure
-
-
-def _views(stage: _Stage, robot: "Robot") -> list[tuple[str, View]]:
     points = stage.points()
     low, high = points.min(axis=0), points.max(axis=0)
     middle = 0.5 * (low + high)
-    middle[2] = stage.table + 0.45 * (high[2] - stage.table)
+    middle[2] = table_height + 0.45 * (high[2] - table_height)
     distance = 2.2 * float(np.linalg.norm(high - low)) / 2
     ahead = middle[:2] - robot.base_pose[:2, 3]
     heading = float(np.arctan2(ahead[1], ahead[0]))
-    views = []
-    for name, turn, height in (("facing the robot", 0.30, 0.42), ("from above", 0.0, 1.15)):
+    pictures = {}
+    for name, turn, rise in (("facing the robot", 0.30, 0.42), ("from above", 0.0, 1.15)):
         angle = heading + turn
-        offset = [np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)]
-        views.append((name, View(middle + distance * np.array(offset), middle)))
-    return views
+        offset = [np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)]
+        view = View(middle + distance * np.array(offset), middle)
+        pictures[name] = _render(stage, points, view)
+    shapes = [picture.shape[1] / picture.shape[0] for picture in pictures.values()]
+    figure = new_figure(max(5.6 * sum(shapes) + 0.4, 8.0), 6.6, title)
+    axes = figure.subplots(1, 2, gridspec_kw={"width_ratios": shapes})
+    for axis, (name, picture) in zip(axes, pictures.items(), strict=True):
+        show_picture(axis, picture, name)
+    entries = [
+        Patch(color=START_COLOR, label="start"),
+        Patch(color=GOAL_COLOR, label="goal"),
+        line("path of the hand", color=HAND_COLOR, linewidth=3),
+        *(Patch(color=tuple(object_color(k)), label=f"object {k}") for k in sorted(meshes)),
+    ]
+    legend(figure, entries, max(1, int(figure.get_figwidth() / 1.7)))
+    return figure
 
 
-def _render(stage: _Stage, view: View) -> np.ndarray:
+def _render(stage: _Stage, points: np.ndarray, view: View) -> np.ndarray:
     """Return one view as an image (h, w, 3) in 0..1."""
-    flat = view.project(stage.points())
-    pad = 0.03 * float((flat.max(axis=0) - flat.min(axis=0)).max())
-    low, high = flat.min(axis=0) - pad, flat.max(axis=0) + pad
-    film = Film(view, low, high, _PIXELS / float((high - low).max()))
+    film = Film.around(view, points, _PIXELS)
     solid = Layer(film)
     for object_id, mesh in stage.meshes.items():
-        solid.add_mesh(*_corners(mesh), object_color(object_id))
-    start, goal, fixed = stage.centers[0], stage.centers[-1], stage.fixed
+        solid.add_mesh(*corners(mesh), object_color(object_id))
+    start, goal, fixed, moving = stage.centers[0], stage.centers[-1], stage.fixed, ~stage.fixed
     solid.add_spheres(start[fixed], stage.radii[fixed], _BASE_COLOR)
-    solid.add_spheres(start[~fixed], stage.radii[~fixed], START_COLOR)
-    solid.add_spheres(goal[~fixed], stage.radii[~fixed], GOAL_COLOR)
-    picture, table = ground(film, stage.table, *_shade(stage))
+    solid.add_spheres(start[moving], stage.radii[moving], START_COLOR)
+    solid.add_spheres(goal[moving], stage.radii[moving], GOAL_COLOR)
+    picture, table = ground(film, stage.table, *_shade(stage, points[:, :2]))
     seen = solid.depth < table
     picture[seen] = solid.shaded()[seen]
     behind = np.minimum(table, solid.depth)
@@ -131,52 +122,22 @@ def _render(stage: _Stage, view: View) -> np.ndarray:
         share = row / (len(stage.centers) - 1)
         color = (1 - share) * np.array(START_COLOR) + share * np.array(GOAL_COLOR)
         ghost = Layer(film)
-        ghost.add_spheres(stage.centers[row][~fixed], stage.radii[~fixed], color)
-        _lay_over(picture, ghost, behind, np.where(ghost.edges(), 2.5 * _CLEAR, _CLEAR))
+        ghost.add_spheres(stage.centers[row][moving], stage.radii[moving], color)
+        clear = np.where(ghost.edges(), 2.5 * _CLEAR, _CLEAR)
+        ghost.lay_over(picture, clear, ghost.depth < behind)
+    length = float(np.linalg.norm(np.diff(stage.hand, axis=0), axis=1).sum())
+    # So close together that beads look like a tube.
+    beads = resample(stage.hand, max(2, int(length / 0.004)))
     hand = Layer(film)
-    beads = _beads(stage.hand, 0.004)
     hand.add_spheres(beads, np.full(len(beads), 0.008), HAND_COLOR)
-    _lay_over(picture, hand, behind, np.where(hand.depth < behind, 1.0, 0.35), hidden_too=True)
-    return np.clip(halved(picture), 0.0, 1.0)
+    hand.lay_over(picture, np.where(hand.depth < behind, 1.0, 0.35))
+    return halved(picture)
 
 
-def _beads(line: np.ndarray, spacing: float) -> np.ndarray:
-    """Return points along a polyline (n, 3) so close together that beads look like a tube."""
-    steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    at = np.linspace(0.0, along[-1], max(2, int(along[-1] / spacing)))
-    return np.stack([np.interp(at, along, column) for column in line.T], axis=1)
-
-
-def _lay_over(
-    picture: np.ndarray,
-    layer: Layer,
-    behind: np.ndarray,
-    share: np.ndarray,
-    *,
-    hidden_too: bool = False,
-) -> None:
-    """Mix a layer into the picture where it is in front (or everywhere it is)."""
-    there = np.isfinite(layer.depth) & (hidden_too | (layer.depth < behind))
-    weight = share[there][:, None]
-    picture[there] = (1 - weight) * picture[there] + weight * layer.shaded()[there]
-
-
-def _corners(mesh: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray]:
-    """Return triangles and the normals at their corners; sharp edges stay sharp."""
-    triangles = np.asarray(mesh.triangles, dtype=np.float64)
-    faces = np.asarray(mesh.faces)
-    own = np.repeat(np.asarray(mesh.face_normals)[:, None], 3, axis=1)
-    smooth = np.asarray(mesh.vertex_normals)[faces]
-    alike = np.einsum("ijk,ijk->ij", own, smooth) > 0.8
-    return triangles, np.where(alike[..., None], smooth, own)
-
-
-def _shade(stage: _Stage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _shade(stage: _Stage, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the table's rectangle and its brightness under what stands over it."""
     from scipy.ndimage import gaussian_filter
 
-    points = stage.points()[:, :2]
     low, high = points.min(axis=0) - 0.12, points.max(axis=0) + 0.12
     cell = 0.006
     shape = tuple(int(n) for n in np.ceil((high - low) / cell) + 1)
@@ -207,15 +168,3 @@ def hand_path(robot: "Robot", path: Float[np.ndarray, "t dof"]) -> Float[np.ndar
     """Return the middle of the last link's spheres along a path, world frame, metres."""
     last = int(np.max(robot.sphere_links))
     return robot.sphere_centers(path)[:, np.asarray(robot.sphere_links) == last].mean(axis=1)
-
-
-def _legend(figure: Figure, meshes: "Mapping[int, trimesh.Trimesh]") -> None:
-    entries: list[Patch | Line2D] = [
-        Patch(color=START_COLOR, label="start"),
-        Patch(color=GOAL_COLOR, label="goal"),
-        Line2D([], [], color=HAND_COLOR, linewidth=3, label="path of the hand"),
-    ]
-    entries += [Patch(color=tuple(object_color(k)), label=f"object {k}") for k in sorted(meshes)]
-    figure.legend(
-        handles=entries, loc="outside lower center", ncols=max(1, int(figure.get_figwidth() / 1.7))
-    )

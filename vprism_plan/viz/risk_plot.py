@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""What a path risks: where it sweeps through the map, and what the map knows there."""
+"""What a path risks: where it sweeps the map and what that knows there, and the room it leaves."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -8,20 +8,25 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from vprism_plan.viz._figures import new_figure
-from vprism_plan.viz.map_plot import Slice, occluded, overlay
+from vprism_plan.viz._figures import hatched, legend, line, name_axes, new_figure, object_color
+from vprism_plan.viz.map_plot import Slice, draw_slice, hatch, object_points
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path
+from vprism_plan.world.sources import object_id, source_of
 
 if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
+    from vprism_plan.collision.entropy import PathEntropy
+    from vprism_plan.collision.margins import SafetyMargins
+    from vprism_plan.collision.reports import RiskEstimate
 
 _PAD = 0.16  # metres shown around the objects
 _POSES = 240  # configurations whose spheres are drawn
 _SAMPLES = 80  # along the path, for the curves
 _MEAN, _LARGEST = "#7b3294", "#e66101"
+_PLACE = "place on the path (waypoint)"
+_SHOWN = 0.4  # metres: farther is as good as far
+_PALE = 250.0  # millimetres from which a cell of the table is white
 
 
 def risk_figure(
@@ -46,33 +51,30 @@ def risk_figure(
     path = np.asarray(path, dtype=np.float64)
     m: Any = checker.world.map
     plane = _horizontal(m, _height(checker, path) if height is None else height, resolution)
-    sweep = _Sweep.of(checker.robot, path, plane)
     ratio = len(plane.b) / len(plane.a)
-    figure = new_figure(12.6, 5.0 * ratio + 4.6)
+    figure = new_figure(12.6, 5.0 * ratio + 4.6, title)
     axes = figure.subplots(2, 2, gridspec_kw={"height_ratios": [5.0 * ratio, 2.9]})
-    if title:
-        figure.suptitle(title)
-    points = plane.points()
-    hidden = plane.image(occluded(m.views, points)).astype(float)
-    support, occupancy = plane.image(m.support(points)), plane.image(m.occupancy(points))
-    panels = (
-        ("P(occupied)", occupancy, "viridis", 1.0, "probability"),
-        ("entropy", plane.image(m.entropy(points)), "magma", np.log(m.n_classes), "nats"),
-    )
-    for axis, (name, values, cmap, top, label) in zip(axes[0], panels, strict=True):
-        image = axis.imshow(
-            values, origin="lower", extent=plane.extent, cmap=cmap, vmin=0, vmax=top
-        )
-        figure.colorbar(image, cax=axis.inset_axes((1.02, 0.0, 0.035, 1.0)), label=label)
-        axis.set_title(f"{name}, {plane.title}", fontsize=10)
-        axis.set_xlabel(plane.a_label)
-        axis.set_ylabel(plane.b_label)
-        overlay(axis, plane, m, hidden, support, occupancy, None)
+    draw_slice(figure, axes[0], plane, m, unit="nats")
+    sweep = _Sweep.of(checker.robot, path, plane)
+    for axis in axes[0]:
         sweep.draw(axis, plane)
     dense, places = densified(path, _SAMPLES)
-    _draw_entropy(axes[1, 0], checker, dense, places)
-    _draw_risk(axes[1, 1], checker, dense, places)
-    _legend(figure)
+    _draw_entropy(axes[1, 0], checker.path_entropy(dense), places)
+    _draw_risk(axes[1, 1], checker.collision_probability(dense), places)
+    for axis in axes[1]:
+        axis.legend(loc="upper left", fontsize=8)
+        axis.set_xlim(0.0, max(float(places[-1]), 1e-9))
+    entries = [
+        line("P(occupied) = 0.5", color="white", linewidth=1.4),
+        line("end of the map's support", color="white", linestyle=":"),
+        hatched("occluded", "///"),
+        line("observed points", marker=".", linestyle="", color="#ffb000"),
+        hatched("swept at this height", "..."),
+        line("robot at the start", color=START_COLOR, linewidth=2),
+        line("robot at the goal", color=GOAL_COLOR, linewidth=2),
+        line("path of the hand, from above", color=HAND_COLOR, linewidth=2),
+    ]
+    legend(figure, entries, 4, dark=True)
     return figure
 
 
@@ -97,29 +99,19 @@ def densified(
 
 def _height(checker: "CollisionChecker", path: np.ndarray) -> float:
     """Height, metres, at which the path comes nearest to an object, over the table."""
-    margins = checker.safety_margin(path, tolerance=0.01).margins
-    nearest = next((m.nearest for m in margins if m.kind == "object"), None)
     plane: Any = checker.world.map.plane
     table = float(plane.offset / plane.normal[2])
+    margins = checker.safety_margin(path, tolerance=0.01).margins
+    nearest = next((m.nearest for m in margins if m.kind == "object"), None)
     return table + 0.02 if nearest is None else max(float(nearest[2]), table + 0.01)
 
 
 def _horizontal(m: Any, height: float, resolution: float) -> Slice:
-    seen = [view.points() for view in m.views]
-    objects = np.concatenate([points[labels > 0] for points, labels in seen])
-    low, high = np.percentile(objects[:, :2], [0.5, 99.5], axis=0)
-    low, high = low - _PAD, high + _PAD
-    table = float(m.plane.offset / m.plane.normal[2])
-    return Slice(
-        title=f"{100 * (height - table):.1f} cm above the table",
-        origin=np.array([0.0, 0.0, height]),
-        u=np.array([1.0, 0.0, 0.0]),
-        v=np.array([0.0, 1.0, 0.0]),
-        a=np.arange(low[0], high[0], resolution),
-        b=np.arange(low[1], high[1], resolution),
-        a_label="x (m)",
-        b_label="y (m)",
-    )
+    low, high = np.percentile(object_points(m)[:, :2], [0.5, 99.5], axis=0)
+    x, y = (np.arange(a, b, resolution) for a, b in zip(low - _PAD, high + _PAD, strict=True))
+    title = f"{100 * (height - float(m.plane.offset / m.plane.normal[2])):.1f} cm above the table"
+    u, v, up = np.eye(3)
+    return Slice(title, ("x (m)", "y (m)"), height * up, u, v, x, y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,34 +129,23 @@ class _Sweep:
         moving = ~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)]
         centers = robot.sphere_centers(dense)[:, moving]
         radii = np.asarray(robot.sphere_radii)[moving]
-        hand = hand_path(robot, dense)[:, :2]
         return cls(
             _cut(centers.reshape(-1, 3), np.tile(radii, len(dense)), plane),
             _cut(centers[0], radii, plane),
             _cut(centers[-1], radii, plane),
-            hand,
+            hand_path(robot, dense)[:, :2],
         )
 
     def draw(self, axis: Axes, plane: Slice) -> None:
-        grid: dict[str, Any] = {"origin": "lower", "extent": plane.extent}
         if (self.whole > 0).any():
-            shade = axis.contourf(
-                self.whole, levels=[0.0, np.inf], colors="none", hatches=["..."], **grid
-            )
-            shade.set_edgecolor((1, 1, 1, 0.55))
-            shade.set_linewidth(0.0)
-        for depth, color, width in (
-            (self.whole, (1.0, 1.0, 1.0), 1.8),
-            (self.start, START_COLOR, 2.0),
-            (self.goal, GOAL_COLOR, 2.0),
-        ):
+            hatch(axis, self.whole, 0.0, "...", 0.55, plane.grid)
+        outlines = ((self.whole, "white"), (self.start, START_COLOR), (self.goal, GOAL_COLOR))
+        for (depth, color), width in zip(outlines, (1.8, 2.0, 2.0), strict=True):
             if depth.min() < 0 < depth.max():
-                axis.contour(depth, levels=[0.0], colors="black", linewidths=width + 1.6, **grid)
-                axis.contour(depth, levels=[0.0], colors=[color], linewidths=width, **grid)
+                for shade, wide in (("black", width + 1.6), ([color], width)):
+                    axis.contour(depth, levels=[0.0], colors=shade, linewidths=wide, **plane.grid)
         axis.plot(*self.hand.T, color="white", linewidth=3.6)
         axis.plot(*self.hand.T, color=HAND_COLOR, linewidth=2.0)
-        axis.set_xlim(plane.extent[:2])
-        axis.set_ylim(plane.extent[2:])
 
 
 def _cut(centers: np.ndarray, radii: np.ndarray, plane: Slice) -> np.ndarray:
@@ -178,10 +159,7 @@ def _cut(centers: np.ndarray, radii: np.ndarray, plane: Slice) -> np.ndarray:
     return depth
 
 
-def _draw_entropy(
-    axis: Axes, checker: "CollisionChecker", dense: np.ndarray, places: np.ndarray
-) -> None:
-    entropy = checker.path_entropy(dense)
+def _draw_entropy(axis: Axes, entropy: "PathEntropy", places: np.ndarray) -> None:
     share = axis.twinx()
     supported = 100 * (1 - np.array(entropy.waypoint_unsupported))
     share.fill_between(places, 0.0, supported, color="0.87", linewidth=0)
@@ -191,59 +169,101 @@ def _draw_entropy(
     axis.patch.set_visible(False)
     axis.plot(places, entropy.waypoint_max, color=_LARGEST, label="largest of a sphere")
     axis.plot(places, entropy.waypoint_mean, color=_MEAN, label="mean over the supported volume")
-    highest = np.nan_to_num(np.array(entropy.waypoint_max)).max()
-    axis.set_ylim(0.0, max(0.1, 1.45 * float(highest)))
-    axis.set_ylabel("entropy (nats)")
-    axis.legend(loc="upper left", fontsize=8)
+    axis.set_ylim(0.0, max(0.1, 1.45 * float(np.nan_to_num(entropy.waypoint_max).max())))
     where = f"{100 * (1 - entropy.unsupported_share):.0f}% of {1000 * entropy.swept_volume:.0f} l"
     mean = "nothing supported" if np.isnan(entropy.swept_mean) else f"{entropy.swept_mean:.2f} nats"
-    _finish(axis, places, f"entropy along the path; swept: {mean} over {where}")
+    name_axes(axis, f"entropy along the path; swept: {mean} over {where}", _PLACE, "entropy (nats)")
 
 
-def _draw_risk(
-    axis: Axes, checker: "CollisionChecker", dense: np.ndarray, places: np.ndarray
-) -> None:
-    risk = checker.collision_probability(dense)
+def _draw_risk(axis: Axes, risk: "RiskEstimate", places: np.ndarray) -> None:
     axis.axhspan(risk.lower, risk.upper, color="0.85", linewidth=0)
-    axis.axhline(
-        risk.probability, color="0.25", linestyle="--", label="whole path, with its interval"
-    )
+    whole = "whole path, with its interval"
+    axis.axhline(risk.probability, color="0.25", linestyle="--", label=whole)
     axis.plot(places, risk.per_waypoint, color=HAND_COLOR, label="this configuration alone")
     top = max(0.05, risk.upper, float(np.max(risk.per_waypoint)))
     axis.set_ylim(-0.02 * top, 1.4 * top)
     if top > 0.5:
         axis.set_yticks(np.linspace(0.0, 1.0, 6))
-    axis.set_ylabel("P(collision)")
-    axis.legend(loc="upper left", fontsize=8)
     name = f"P(collision) of the path: {risk.probability:.3f}"
     if risk.first_contact:
         first = risk.first_contact[0]
         name += f", first {first.link} with {first.body}"
-    _finish(axis, places, name)
+    name_axes(axis, name, _PLACE, "P(collision)")
 
 
-def _finish(axis: Axes, places: np.ndarray, name: str) -> None:
-    axis.set_title(name, fontsize=10)
-    axis.set_xlabel("place on the path (waypoint)")
+def margin_figure(
+    checker: "CollisionChecker",
+    path: Float[np.ndarray, "t dof"],
+    *,
+    tolerance: float = 0.001,
+    title: str | None = None,
+) -> Figure:
+    """Draw the clearance to every obstacle along a path, and the smallest of every pair.
+
+    Args:
+        checker: a checker over a `World`.
+        path: (T, dof) waypoints.
+        tolerance: no sphere moves more than this, metres, to the nearest sample; the
+            table's numbers are bounds with that much subtracted.
+        title: above both panels.
+    """
+    from vprism_plan.collision.margins import margin_profile
+
+    margins = checker.safety_margin(path, tolerance)
+    places, profile = margin_profile(checker, path, tolerance)
+    met = {margin.link for margin in margins.margins}
+    links = [name for name in checker.robot.link_names if name in met]
+    bodies = list(margins.of_bodies())
+    rows = 0.36 * len(links)
+    figure = new_figure(max(8.0, 1.15 * len(bodies) + 3.4), 4.0 + rows + 1.2, title)
+    above, below = figure.subplots(2, 1, gridspec_kw={"height_ratios": [4.0, rows + 0.6]})
+    _draw_profile(above, places, profile, 1000 * margins.margin)
+    _draw_pairs(below, margins, links, bodies)
+    return figure
+
+
+def body_style(name: str) -> tuple[Any, str]:
+    """Return colour and line style that stand for an obstacle in every picture of margins."""
+    source, number = source_of(name), object_id(name)
+    return source.color if number is None else tuple(object_color(number)), source.line
+
+
+def _draw_profile(
+    axis: Axes, places: np.ndarray, profile: dict[str, np.ndarray], required: float
+) -> None:
+    smallest = {name: float(values.min()) for name, values in profile.items()}
+    for name in sorted(profile, key=smallest.__getitem__):
+        color, style = body_style(name)
+        label = f"{name}: {1000 * smallest[name]:.0f} mm"
+        axis.plot(places, 1000 * profile[name], color=color, linestyle=style, label=label)
+    axis.axhspan(-1e4, required, color=(0.80, 0.10, 0.10, 0.14), linewidth=0)
+    axis.set_ylim(1.1 * min(0.0, 1000 * min(smallest.values())) - 8.0, 1000 * _SHOWN)
     axis.set_xlim(0.0, max(float(places[-1]), 1e-9))
+    name = f"clearance of the whole robot; refused below {required:.0f} mm (red)"
+    name_axes(axis, name, _PLACE, "clearance (mm)")
+    axis.grid(color="0.9")
+    axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, title="smallest")
 
 
-def _legend(figure: Figure) -> None:
-    entries: list[Line2D | Patch] = [
-        Line2D([], [], color="white", linewidth=1.4, label="P(occupied) = 0.5"),
-        Line2D([], [], color="white", linestyle=":", label="end of the map's support"),
-        Patch(facecolor="#555555", edgecolor="white", hatch="///", label="occluded"),
-        Line2D([], [], marker=".", linestyle="", color="#ffb000", label="observed points"),
-        Patch(facecolor="#555555", edgecolor="white", hatch="...", label="swept at this height"),
-        Line2D([], [], color=START_COLOR, linewidth=2, label="robot at the start"),
-        Line2D([], [], color=GOAL_COLOR, linewidth=2, label="robot at the goal"),
-        Line2D([], [], color=HAND_COLOR, linewidth=2, label="path of the hand, from above"),
-    ]
-    figure.legend(
-        handles=entries,
-        loc="outside lower center",
-        ncols=4,
-        facecolor="#555555",
-        labelcolor="white",
-        framealpha=1.0,
+def _draw_pairs(axis: Axes, margins: "SafetyMargins", links: list[str], bodies: list[str]) -> None:
+    """A table of the smallest clearances, coloured by how small they are."""
+    values = np.full((len(links), len(bodies)), np.nan)
+    allowed = np.zeros(values.shape, dtype=bool)
+    for margin in margins.margins:
+        cell = links.index(margin.link), bodies.index(margin.body)
+        values[cell], allowed[cell] = 1000 * margin.clearance, margin.allowed
+    axis.imshow(values, cmap="OrRd_r", vmin=-60.0, vmax=_PALE, aspect="auto")
+    for row, column in np.ndindex(values.shape):
+        text = f"{values[row, column]:.0f}{'*' if allowed[row, column] else ''}"
+        color = "white" if values[row, column] < 0.25 * _PALE else "black"
+        axis.text(column, row, text, ha="center", va="center", fontsize=8, color=color)
+    axis.set_xticks(range(len(bodies)), [body.replace(" ", "\n") for body in bodies], fontsize=8)
+    axis.set_yticks(range(len(links)), links, fontsize=8)
+    axis.set_title(
+        "smallest clearance of every link over the whole path (mm; bounds, "
+        f"{1000 * margins.tolerance:g} mm taken off for what lies between samples)"
+        + ("; * may be touched" if allowed.any() else ""),
+        fontsize=10,
     )
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)

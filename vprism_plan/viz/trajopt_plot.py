@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the optimiser did: where the hand went before and after, and how the costs fell."""
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from vprism_plan.viz._figures import PALETTE, new_figure, object_color
+from vprism_plan.viz._figures import PALETTE, legend, line, name_axes, new_figure, object_color
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path, resample
 from vprism_plan.world.sources import source_of
 
@@ -18,7 +19,10 @@ if TYPE_CHECKING:
     from vprism_plan.collision import CollisionChecker
     from vprism_plan.trajopt import OptimizeResult
 
-_BEGUN, _ENDED, _GIVEN = "0.62", "#2f6d8f", "#1b1b1b"
+_BEGUN: dict[str, Any] = {"color": "0.62", "linestyle": ":"}
+_ENDED: dict[str, Any] = {"color": "#2f6d8f", "linewidth": 0.9}
+_GIVEN: dict[str, Any] = {"color": "#1b1b1b", "dashes": (4, 2)}
+_BEST: dict[str, Any] = {"color": HAND_COLOR, "linewidth": 2.4}
 _UNSEEN = np.array([0.80, 0.80, 0.80])
 _OTHER = np.array([0.45, 0.42, 0.40])
 _PAD = 0.06  # metres around what is shown
@@ -44,96 +48,72 @@ def trajopt_figure(
     Raises:
         ValueError: the optimisation never began.
     """
-    if result.history is None or result.begun is None or result.ended is None:
+    history, begun, ended = result.history, result.begun, result.ended
+    if history is None or begun is None or ended is None:
         raise ValueError(f"there is nothing to draw: {result.message}")
-    paths = _Paths(checker, result, given)
-    low, high = paths.box()
+    world: Any = checker.world
+    ways = [(path, {**_BEGUN, "linewidth": 0.9}) for path in begun]
+    ways += [(path, {**_ENDED, "alpha": 0.8}) for path in ended]
+    entries: list[Line2D | Patch] = [
+        line("seeds as they began", **_BEGUN),
+        line("seeds as they ended", **_ENDED),
+    ]
+    if given is not None:
+        ways.append((np.asarray(given, dtype=np.float64), {**_GIVEN, "linewidth": 1.4}))
+        entries.append(line("the path that was given", **_GIVEN))
+    if result.path is not None:
+        ways += [(result.path, {"color": "white", "linewidth": 4.0}), (result.path, _BEST)]
+        entries.append(line("returned, verified", **_BEST))
+    hands = [(hand_path(checker.robot, resample(path, 120)), style) for path, style in ways]
+    low, high = _box(world, [hand for hand, _ in hands[len(begun) :]])
     sizes = high - low
     side = int(np.argmax(sizes[:2]))
-    width = 12.6
-    height = 0.45 * width * max(sizes[1] / sizes[0], sizes[2] / sizes[side])
-    tall = float(np.clip(height, 2.6, 6.0))
-    figure = new_figure(width, tall + 4.4)
+    tall = 0.45 * 12.6 * max(sizes[1] / sizes[0], sizes[2] / sizes[side])
+    tall = float(np.clip(tall, 2.6, 6.0))
+    figure = new_figure(12.6, tall + 4.4, title)
     axes = figure.subplots(2, 2, gridspec_kw={"height_ratios": [tall, 3.0]})
-    if title:
-        figure.suptitle(title)
-    for axis, (a, b), name in (
-        (axes[0, 0], (0, 1), "from above"),
-        (axes[0, 1], (side, 2), "from the side"),
-    ):
-        _draw_world(axis, checker.world, a, b)
-        paths.draw(axis, a, b)
-        axis.set_xlim(low[a], high[a])
-        axis.set_ylim(low[b], high[b])
-        axis.set_aspect("equal")
-        axis.set_xlabel(f"{'xyz'[a]} (m)")
-        axis.set_ylabel(f"{'xyz'[b]} (m)")
-        axis.set_title(f"path of the hand, {name}", fontsize=10)
-    _draw_terms(axes[1, 0], result)
-    _draw_seeds(axes[1, 1], result)
-    _legend(figure, paths, checker.world)
+    first, last = hands[len(begun)][0][[0, -1]]
+    views = ((0, 1, "from above"), (side, 2, "from the side"))
+    for axis, (a, b, name) in zip(axes[0], views, strict=True):
+        _draw_world(axis, world, a, b)
+        for hand, style in hands:
+            axis.plot(hand[:, a], hand[:, b], **style)
+        for end, color in ((first, START_COLOR), (last, GOAL_COLOR)):
+            axis.plot(end[a], end[b], "o", color=color, markersize=8, zorder=5)
+        axis.set(xlim=(low[a], high[a]), ylim=(low[b], high[b]), aspect="equal")
+        name_axes(axis, f"path of the hand, {name}", f"{'xyz'[a]} (m)", f"{'xyz'[b]} (m)")
+    _draw_costs(axes[1, 0], axes[1, 1], result, history)
+    entries += [
+        line("start", marker="o", linestyle="", color=START_COLOR),
+        line("goal", marker="o", linestyle="", color=GOAL_COLOR),
+        Patch(color=tuple(_UNSEEN), label="unseen, an obstacle by policy"),
+        Patch(color=tuple(_OTHER), label="other obstacles"),
+        *(Patch(color=tuple(_shade(i)), label=f"object {i}") for i in world.map.object_ids),
+    ]
+    legend(figure, entries, 5)
     return figure
 
 
-class _Paths:
-    """Ways of the hand, (n, 3) each, metres."""
-
-    def __init__(self, checker: Any, result: "OptimizeResult", given: Any) -> None:
-        robot = checker.robot
-        assert result.begun is not None
-        assert result.ended is not None
-
-        def hand(path: np.ndarray) -> np.ndarray:
-            return hand_path(robot, resample(path, 120))
-
-        self.begun = [hand(path) for path in result.begun]
-        self.ended = [hand(path) for path in result.ended]
-        self.path = None if result.path is None else hand(result.path)
-        self.given = None if given is None else hand(np.asarray(given, dtype=np.float64))
-        field = checker.world.field
-        self.solid = field.origin + field.spacing * np.argwhere(
-            (field.distance <= 0.0) & (field.source < len(checker.world.map.object_ids))
-        )
-
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of what is worth showing: what became of the seeds, and the objects."""
-        shown = [*self.ended, *(w for w in (self.path, self.given) if w is not None), self.solid]
-        points = np.concatenate(shown)
-        return points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
-
-    def draw(self, axis: Axes, a: int, b: int) -> None:
-        for way in self.begun:
-            axis.plot(way[:, a], way[:, b], color=_BEGUN, linewidth=0.9, linestyle=":")
-        for way in self.ended:
-            axis.plot(way[:, a], way[:, b], color=_ENDED, linewidth=0.9, alpha=0.8)
-        if self.given is not None:
-            axis.plot(
-                self.given[:, a], self.given[:, b], color=_GIVEN, linewidth=1.4, dashes=(4, 2)
-            )
-        if self.path is not None:
-            axis.plot(self.path[:, a], self.path[:, b], color="white", linewidth=4.0)
-            axis.plot(self.path[:, a], self.path[:, b], color=HAND_COLOR, linewidth=2.4)
-        first, last = self.ended[0][0], self.ended[0][-1]
-        axis.plot(first[a], first[b], "o", color=START_COLOR, markersize=8, zorder=5)
-        axis.plot(last[a], last[b], "o", color=GOAL_COLOR, markersize=8, zorder=5)
+def _box(world: Any, hands: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of what is worth showing: what became of the seeds, and the objects."""
+    field = world.field
+    solid = (field.distance <= 0.0) & (field.source < len(world.map.object_ids))
+    points = np.concatenate([*hands, field.origin + field.spacing * np.argwhere(solid)])
+    return points.min(axis=0) - _PAD, points.max(axis=0) + _PAD
 
 
 def _draw_world(axis: Axes, world: Any, a: int, b: int) -> None:
     """Shadows of the obstacles on a plane of two axes: objects over everything else."""
     field = world.field
-    along = 3 - a - b
-    solid = field.distance <= 0.0
     objects = len(world.map.object_ids)
-    names = np.where(solid, field.source, -1)
+    names = np.where(field.distance <= 0.0, field.source, -1)
     image = np.ones((field.distance.shape[a], field.distance.shape[b], 3))
     unseen = {k for k, name in enumerate(world.sources) if source_of(name).policy}
-    order = [*sorted(unseen), *(k for k in range(objects, len(world.sources)) if k not in unseen)]
-    for k in [*order, *range(objects)]:
-        shadow = (names == k).any(axis=along)
-        color = _UNSEEN if k in unseen else _OTHER
-        if k < objects:
-            color = _shade(world.map.object_ids[k])
-        image[shadow] = color
+    others = [k for k in range(objects, len(world.sources)) if k not in unseen]
+    colors = dict.fromkeys(sorted(unseen), _UNSEEN) | dict.fromkeys(others, _OTHER)
+    colors |= {k: _shade(object_id) for k, object_id in enumerate(world.map.object_ids)}
+    for k, color in colors.items():
+        image[(names == k).any(axis=3 - a - b)] = color
     low, high = field.origin - 0.5 * field.spacing, field.upper + 0.5 * field.spacing
     extent = (low[a], high[a], low[b], high[b])
     axis.imshow(np.swapaxes(image, 0, 1), origin="lower", extent=extent, aspect="auto")
@@ -147,81 +127,34 @@ def _shade(object_id: int) -> np.ndarray:
     return 0.35 + 0.65 * object_color(object_id)
 
 
-def _shown_seed(result: "OptimizeResult") -> int:
-    """The winner, or the seed of least cost."""
-    if result.report.winner is not None:
-        return result.report.winner
-    return int(np.argmin([seed.cost for seed in result.report.seeds]))
-
-
-def _draw_terms(axis: Axes, result: "OptimizeResult") -> None:
-    history = result.history
-    assert history is not None
-    seed = _shown_seed(result)
+def _draw_costs(left: Axes, right: Axes, result: "OptimizeResult", history: Any) -> None:
+    """The terms of the winner, or of the seed of least cost; the cost of each seed."""
+    seeds, winner = result.report.seeds, result.report.winner
+    shown = int(np.argmin([seed.cost for seed in seeds])) if winner is None else winner
     rows = np.arange(1, len(history.cost) + 1)
-    axis.plot(rows, history.cost[:, seed], color="0.75", linewidth=4.0, label="sum")
-    for number, (name, values) in enumerate(history.terms.items()):
-        color = _TERMS[number % len(_TERMS)]
-        shown = np.where(values[:, seed] > 0.0, values[:, seed], np.nan)
-        axis.plot(rows, shown, color=color, label=name)
-    terms = np.stack([values[:, seed] for values in history.terms.values()])
-    _finish(axis, result, terms, f"terms of seed {seed} ({result.report.seeds[seed].name})")
-    axis.legend(loc="upper right", fontsize=8)
+    left.plot(rows, history.cost[:, shown], color="0.75", linewidth=4.0, label="sum")
+    terms = np.stack([values[:, shown] for values in history.terms.values()])
+    for name, values, color in zip(history.terms, terms, cycle(_TERMS), strict=False):
+        left.plot(rows, np.where(values > 0.0, values, np.nan), color=color, label=name)
+    _finish(left, history, terms, f"terms of seed {shown} ({seeds[shown].name})")
+    for number, seed in enumerate(seeds):
+        style = {"color": PALETTE[number % len(PALETTE)], "linewidth": 1.2, "zorder": 2}
+        if number == winner:
+            style = {"color": HAND_COLOR, "linewidth": 2.6, "zorder": 3}
+        note = " (returned)" if number == winner else " (refused)" if seed.refused else ""
+        style |= {"linestyle": "--" if seed.refused else "-", "label": f"{seed.name}{note}"}
+        right.plot(rows, history.cost[:, number], **style)
+    _finish(right, history, history.cost, "cost of each seed", columns=1 + (len(seeds) > 6))
 
 
-def _draw_seeds(axis: Axes, result: "OptimizeResult") -> None:
-    history = result.history
-    assert history is not None
-    rows = np.arange(1, len(history.cost) + 1)
-    winner = result.report.winner
-    for number, seed in enumerate(result.report.seeds):
-        own = number == winner
-        axis.plot(
-            rows,
-            history.cost[:, number],
-            color=HAND_COLOR if own else PALETTE[number % len(PALETTE)],
-            linewidth=2.6 if own else 1.2,
-            linestyle="--" if seed.refused else "-",
-            label=f"{seed.name}{' (returned)' if own else ' (refused)' if seed.refused else ''}",
-            zorder=3 if own else 2,
-        )
-    _finish(axis, result, history.cost, "cost of each seed")
-    axis.legend(loc="upper right", fontsize=8, ncols=1 + (len(result.report.seeds) > 6))
-
-
-def _finish(axis: Axes, result: "OptimizeResult", shown: np.ndarray, name: str) -> None:
+def _finish(axis: Axes, history: Any, shown: np.ndarray, name: str, columns: int = 1) -> None:
     """Logarithmic axes around the positive values that are shown."""
-    history = result.history
-    assert history is not None
     top = float(np.max(history.cost[np.isfinite(history.cost)], initial=_LOWEST))
     least = float(np.min(shown[shown > 0.0], initial=top))
     axis.set_yscale("log")
     axis.set_ylim(max(0.6 * least, _LOWEST * top), 2.0 * top)
     for row in np.flatnonzero(np.diff(history.round)):
         axis.axvline(row + 1.5, color="0.6", linewidth=0.8, linestyle="--")
-    axis.set_title(name, fontsize=10)
-    axis.set_xlabel("batch of evaluations")
-    axis.set_ylabel("cost")
+    name_axes(axis, name, "batch of evaluations", "cost")
     axis.grid(alpha=0.25)
-
-
-def _legend(figure: Figure, paths: _Paths, world: Any) -> None:
-    entries: list[Line2D | Patch] = [
-        Line2D([], [], color=_BEGUN, linestyle=":", label="seeds as they began"),
-        Line2D([], [], color=_ENDED, linewidth=0.9, label="seeds as they ended"),
-    ]
-    if paths.given is not None:
-        entries.append(Line2D([], [], color=_GIVEN, dashes=(4, 2), label="the path that was given"))
-    if paths.path is not None:
-        entries.append(Line2D([], [], color=HAND_COLOR, linewidth=2.4, label="returned, verified"))
-    entries += [
-        Line2D([], [], marker="o", linestyle="", color=START_COLOR, label="start"),
-        Line2D([], [], marker="o", linestyle="", color=GOAL_COLOR, label="goal"),
-        Patch(color=tuple(_UNSEEN), label="unseen, an obstacle by policy"),
-        Patch(color=tuple(_OTHER), label="other obstacles"),
-    ]
-    entries += [
-        Patch(color=tuple(_shade(object_id)), label=f"object {object_id}")
-        for object_id in world.map.object_ids
-    ]
-    figure.legend(handles=entries, loc="outside lower center", ncols=5)
+    axis.legend(loc="upper right", fontsize=8, ncols=columns)

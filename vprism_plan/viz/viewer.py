@@ -8,21 +8,81 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from vprism_plan.errors import ConfigError, MissingDependencyError
 from vprism_plan.viz._figures import object_color
-from vprism_plan.viz._viewer_parts import EntropyVolume, place_solids, robot_solids, to_bytes
 from vprism_plan.viz.plan_plot import hand_path
+from vprism_plan.viz.robot_plot import link_meshes
 
 if TYPE_CHECKING:
+    import trimesh
+
     from vprism_plan.mapping import VPrismMap
     from vprism_plan.planning import Trajectory
     from vprism_plan.robots import Robot
 
 _POINTS = 20_000  # of an object, drawn at most
 _POSES = 300  # of a trajectory
-_ROBOT_COLOR = (0.30, 0.42, 0.58)
+_ROBOT_COLOR = (76, 107, 148)
+_CHUNK = 1 << 16
+_SUPPORTED = 0.5  # of the largest kernel mass: the rim of the lattice has less
+_MOST = 2_000_000  # grid points; a coarser grid is taken above
+
+
+class EntropyVolume:
+    """The entropy of a map (nats) on a grid over its support.
+
+    Attributes:
+        corners: (2, 3) first and last grid point, m.
+        heights: lowest and highest slice and their distance, m.
+        values: (nx, ny, nz) nats; NaN where the map has little support (see `_SUPPORTED`):
+            there it repeats its prior.
+    """
+
+    def __init__(self, m: "VPrismMap", resolution: float) -> None:
+        lower, upper = m.support_bounds()
+        count = float(np.prod((upper - lower) / resolution))
+        resolution *= max(1.0, (count / _MOST) ** (1 / 3))
+        self._axes = [np.arange(lower[k], upper[k], resolution) for k in range(3)]
+        grid = np.stack(np.meshgrid(*self._axes, indexing="ij"), axis=-1)
+        points = grid.reshape(-1, 3)
+        chunks = [points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
+        values = np.concatenate([m.entropy(chunk) for chunk in chunks])
+        mass = np.concatenate([m.support(chunk) for chunk in chunks])
+        supported = mass > _SUPPORTED * mass.max()
+        self.values: np.ndarray = np.where(supported, values, np.nan).reshape(grid.shape[:3])
+        self._grid, self._top, z = grid, float(np.log(m.n_classes)), self._axes[2]
+        self.heights = float(z[0]), float(z[-1]), round(float(resolution), 4)
+        self.corners = np.stack([grid[0, 0, 0], grid[-1, -1, -1]])
+
+    def cloud(self, at_least: float) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+        """Return the points whose entropy is at least so many nats, and their colours."""
+        with np.errstate(invalid="ignore"):
+            chosen = self.values >= at_least
+        return self._grid[chosen].astype(np.float32), self._colors(self.values[chosen])
+
+    def slice(self, height: float) -> "trimesh.Trimesh":
+        """Return the layer nearest to a height (m) as a flat, coloured surface."""
+        import trimesh
+
+        layer = int(np.abs(self._axes[2] - height).argmin())
+        nx, ny, _ = self.values.shape
+        corner = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)).ravel()
+        faces = corner[:, None] + np.array([[[0, ny, ny + 1]], [[0, ny + 1, 1]]])
+        faces = faces.reshape(-1, 3)
+        faces = np.concatenate([faces, faces[:, ::-1]])  # seen from below as well
+        colors = self._colors(self.values[:, :, layer].reshape(-1))
+        colors = np.column_stack([colors, np.full(len(colors), 255, np.uint8)])
+        points = self._grid[:, :, layer].reshape(-1, 3)
+        return trimesh.Trimesh(points, faces, vertex_colors=colors, process=False)
+
+    def _colors(self, nats: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+        from matplotlib import colormaps
+
+        shades = colormaps["magma"](np.nan_to_num(nats / self._top), bytes=True)[:, :3]
+        shades[np.isnan(nats)] = 200
+        return np.asarray(shades, dtype=np.uint8)
 
 
 class Viewer:
@@ -71,13 +131,16 @@ class Viewer:
                     f"a trajectory of {joints} joints is given, but {what}; give the robot that "
                     "it was planned for"
                 )
-        self.map, self.robot, self.trajectory = m, robot, trajectory
+        require_viser()
+        import viser
+
+        self.map, self.robot, self.trajectory, self._resolution = m, robot, trajectory, resolution
         self.nodes: dict[str, Any] = {}
         self.controls: dict[str, Any] = {}
-        self._resolution = resolution
         self._surfaces: dict[float, dict[int, Any]] = {}
         self._lock = threading.Lock()
-        self.server = _start(host, port)
+        with _silence():
+            self.server = viser.ViserServer(host, port, label="vprism_plan", verbose=False)
         try:
             self._fill(level)
         except BaseException:
@@ -99,7 +162,6 @@ class Viewer:
         with _silence():
             self.server.stop()
 
-    # ------------------------------------------------------------------ what is shown
     def show_level(self, level: float) -> None:
         """Draw the objects' surfaces at another P(occupied)."""
         from vprism_plan.world import extract_meshes
@@ -108,199 +170,159 @@ class Viewer:
         with self._lock:
             if level not in self._surfaces:
                 self._surfaces[level] = extract_meshes(self.map, level, self._resolution)
-            meshes = self._surfaces[level]
-            self._remove("/objects/")
-            for object_id, mesh in meshes.items():
-                self.nodes[f"/objects/{object_id}"] = self.server.scene.add_mesh_simple(
-                    f"/objects/{object_id}",
-                    np.asarray(mesh.vertices, dtype=np.float32),
-                    np.asarray(mesh.faces, dtype=np.uint32),
-                    color=to_bytes(object_color(object_id)),
-                    side="double",
-                    visible=self._wanted("objects"),
-                )
+            style = self._cleared("/objects/", "objects") | {"side": "double"}
+            for object_id, mesh in self._surfaces[level].items():
+                color, path = _bytes(object_color(object_id)), f"/objects/{object_id}"
+                self._add("mesh_simple", path, *_arrays(mesh), color=color, **style)
 
     def show_entropy(self, at_least: float) -> None:
         """Draw the points that the map supports and whose entropy (nats) is at least this."""
         points, colors = self._volume.cloud(float(at_least))
         with self._lock:
-            self._remove("/entropy/cloud")
+            style = self._cleared("/entropy/cloud", "entropy cloud") | {"point_shape": "circle"}
             if len(points):
-                self.nodes["/entropy/cloud"] = self.server.scene.add_point_cloud(
-                    "/entropy/cloud",
-                    points,
-                    colors,
-                    point_size=0.35 * self._resolution,
-                    point_shape="circle",
-                    visible=self._wanted("entropy cloud"),
-                )
+                style["point_size"] = 0.35 * self._resolution
+                self._add("point_cloud", "/entropy/cloud", points, colors, **style)
 
     def show_slice(self, height: float) -> None:
         """Draw the entropy on the horizontal slice nearest to a height (m, world)."""
         mesh = self._volume.slice(float(height))
         with self._lock:
-            self._remove("/entropy/slice")
-            self.nodes["/entropy/slice"] = self.server.scene.add_mesh_trimesh(
-                "/entropy/slice",
-                mesh,
-                cast_shadow=False,
-                receive_shadow=False,
-                visible=self._wanted("entropy slice"),
-            )
+            style = self._cleared("/entropy/slice", "entropy slice")
+            style |= {"cast_shadow": False, "receive_shadow": False}
+            self._add("mesh_trimesh", "/entropy/slice", mesh, **style)
 
     def place_robot(self, q: Float[np.ndarray, "dof"]) -> None:
         """Move the robot to a configuration."""
         assert self.robot is not None
         q = self.robot.check_configuration(q)
+        poses = self.robot.link_poses(q)
         with self._lock, self.server.atomic():
             centers = self.robot.sphere_centers(q[None])[0]
             self.nodes["/robot/spheres"].batched_positions = centers.astype(np.float32)
-            for name, (wxyz, position) in place_solids(self.robot, self._solids, q).items():
-                self.nodes[name].wxyz, self.nodes[name].position = wxyz, position
+            for path, link in self._solids.items():
+                node, pose = self.nodes[path], poses[link]
+                node.wxyz, node.position = _quaternion(pose), pose[:3, 3]
 
-    # ------------------------------------------------------------------ building it
     def _fill(self, level: float) -> None:
         scene, gui = self.server.scene, self.server.gui
         scene.set_up_direction("+z")
         self._volume = EntropyVolume(self.map, self._resolution)
-        low, high = self._volume.corners
-        middle = 0.5 * (low + high)
-        scene.add_grid(
-            "/table",
-            width=2.0,
-            height=2.0,
-            cell_size=0.1,
-            section_size=0.5,
-            position=(*middle[:2], self._table_height(middle)),
-            plane_color=(235, 232, 225),
-            plane_opacity=0.8,
-        )
+        middle = 0.5 * self._volume.corners.sum(axis=0)
+        plane = self.map.plane
+        table = float((plane.offset - plane.normal[:2] @ middle[:2]) / plane.normal[2])
+        size: dict[str, Any] = {"width": 2.0, "height": 2.0, "cell_size": 0.1, "section_size": 0.5}
+        style: dict[str, Any] = {"plane_color": (235, 232, 225), "plane_opacity": 0.8}
+        scene.add_grid("/table", position=(*middle[:2], table), **size, **style)
         self._add_views()
         with gui.add_folder("map"):
             self._box("objects", True, "/objects/")
-            self._slider("level", 0.05, 0.95, 0.05, round(level, 2), self.show_level)
+            bounds = (0.05, 0.95, 0.05, round(level, 2))
+            self._slider("level", "level: P(occupied)", self.show_level, *bounds)
             self._box("observed points", False, "/points/")
             self._box("cameras", False, "/cameras/")
         with gui.add_folder("entropy"):
             top = float(np.log(self.map.n_classes))
+            bounds = (0.0, round(top, 2), 0.01, round(0.3 * top, 2))
             self._box("entropy cloud", True, "/entropy/cloud")
-            self._slider(
-                "entropy", 0.0, round(top, 2), 0.01, round(0.3 * top, 2), self.show_entropy
-            )
+            self._slider("entropy", "entropy at least (nats)", self.show_entropy, *bounds)
             self._box("entropy slice", False, "/entropy/slice")
-            self._slider(
-                "height", *self._volume.heights, round(float(middle[2]), 3), self.show_slice
-            )
+            bounds = (*self._volume.heights, round(float(middle[2]), 3))
+            self._slider("height", "height of the slice (m)", self.show_slice, *bounds)
         self.show_level(self.controls["level"].value)
         self.show_entropy(self.controls["entropy"].value)
         self.show_slice(self.controls["height"].value)
         if self.robot is not None:
-            self._add_robot()
+            self._add_robot(self.robot)
         eye = self.map.views[0].camera_center
         self.server.initial_camera.position = tuple(middle + 1.5 * (eye - middle))
         self.server.initial_camera.look_at = tuple(middle)
 
-    def _table_height(self, at: Float[np.ndarray, "3"]) -> float:
-        plane = self.map.plane
-        return float((plane.offset - plane.normal[:2] @ at[:2]) / plane.normal[2])
-
     def _add_views(self) -> None:
-        from scipy.spatial.transform import Rotation
-
         seen = [view.points() for view in self.map.views]
         for object_id in self.map.object_ids:
             points = np.concatenate([p[labels == object_id] for p, labels in seen])
-            self.nodes[f"/points/{object_id}"] = self.server.scene.add_point_cloud(
-                f"/points/{object_id}",
-                points[:: max(1, len(points) // _POINTS)].astype(np.float32),
-                to_bytes(0.6 * object_color(object_id)),
-                point_size=0.002,
-                visible=False,
-            )
+            points = points[:: max(1, len(points) // _POINTS)].astype(np.float32)
+            color, path = _bytes(0.6 * object_color(object_id)), f"/points/{object_id}"
+            self._add("point_cloud", path, points, color, point_size=0.002, visible=False)
         for number, view in enumerate(self.map.views):
             height, width = view.shape
-            x, y, z, w = Rotation.from_matrix(view.pose[:3, :3]).as_quat()
-            self.nodes[f"/cameras/{number}"] = self.server.scene.add_camera_frustum(
+            self._add(
+                "camera_frustum",
                 f"/cameras/{number}",
                 fov=2.0 * float(np.arctan(0.5 * height / view.intrinsics[1, 1])),
                 aspect=width / height,
                 scale=0.08,
                 thickness=0.002,
-                wxyz=(w, x, y, z),
+                wxyz=_quaternion(view.pose),
                 position=tuple(view.camera_center),
                 image=None if view.color is None else view.color[::4, ::4],
                 visible=False,
             )
 
-    def _add_robot(self) -> None:
+    def _add_robot(self, robot: "Robot") -> None:
         import trimesh
 
-        robot, scene = self.robot, self.server.scene
-        assert robot is not None
-        ball = trimesh.creation.icosphere(subdivisions=2)
         count = len(robot.sphere_radii)
-        self.nodes["/robot/spheres"] = scene.add_batched_meshes_simple(
+        self._add(
+            "batched_meshes_simple",
             "/robot/spheres",
-            np.asarray(ball.vertices, dtype=np.float32),
-            np.asarray(ball.faces, dtype=np.uint32),
+            *_arrays(trimesh.creation.icosphere(subdivisions=2)),
             batched_wxyzs=np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (count, 1)),
             batched_positions=np.zeros((count, 3), dtype=np.float32),
             batched_scales=np.asarray(robot.sphere_radii, dtype=np.float32),
-            batched_colors=to_bytes(np.array(_ROBOT_COLOR)),
+            batched_colors=_ROBOT_COLOR,
         )
-        self._solids = robot_solids(robot)
-        for name, solid in self._solids.items():
-            self.nodes[name] = scene.add_mesh_simple(
-                name,
-                np.asarray(solid.mesh.vertices, dtype=np.float32),
-                np.asarray(solid.mesh.faces, dtype=np.uint32),
-                color=to_bytes(np.array(_ROBOT_COLOR)),
-                flat_shading=True,
-                visible=False,
-            )
+        self._solids = {}  # path -> link
+        style = {"color": _ROBOT_COLOR, "flat_shading": True, "visible": False}
+        for link, number, mesh in link_meshes(robot.meshes, robot.geometry):
+            path = f"/robot/solids/{link}/{number}"
+            self._solids[path] = link
+            self._add("mesh_simple", path, *_arrays(mesh), **style)
         with self.server.gui.add_folder("robot"):
             self._box("spheres", True, "/robot/spheres")
             if self._solids:
                 self._box("solids", False, "/robot/solids/")
-            if self.trajectory is None:
-                self._add_joints(robot)
-            else:
+            if self.trajectory is not None:
                 self._add_motion(robot, self.trajectory)
+                return
+            bounds = np.stack([robot.lower, robot.upper, robot.neutral], axis=1).tolist()
+            for name, (low, high, value) in zip(robot.joint_names, bounds, strict=True):
+                self._slider(name, name, self._follow_joints, low, high, 0.001, value)
+            self.place_robot(robot.neutral)
 
-    def _add_joints(self, robot: "Robot") -> None:
-        def follow(_: float) -> None:
-            self.place_robot(np.array([self.controls[name].value for name in robot.joint_names]))
-
-        for i, name in enumerate(robot.joint_names):
-            low, high = float(robot.lower[i]), float(robot.upper[i])
-            self._slider(name, low, high, 0.001, float(robot.neutral[i]), follow)
-        self.place_robot(robot.neutral)
+    def _follow_joints(self, _: float) -> None:
+        assert self.robot is not None
+        names = self.robot.joint_names
+        self.place_robot(np.array([self.controls[name].value for name in names]))
 
     def _add_motion(self, robot: "Robot", trajectory: "Trajectory") -> None:
         times = np.linspace(0.0, trajectory.duration, _POSES)
         hand = hand_path(robot, trajectory.sample(times)[0]).astype(np.float32)
-        self.nodes["/robot/path"] = self.server.scene.add_line_segments(
-            "/robot/path",
-            np.stack([hand[:-1], hand[1:]], axis=1),
-            (184, 13, 89),
-            thickness=0.006,
-        )
+        pieces = np.stack([hand[:-1], hand[1:]], axis=1)
+        self._add("line_segments", "/robot/path", pieces, (184, 13, 89), thickness=0.006)
         self._box("path of the hand", True, "/robot/path")
 
         def follow(time: float) -> None:
             self.place_robot(trajectory.sample(np.array([time]))[0][0])
 
-        self._slider("time", 0.0, max(trajectory.duration, 0.01), 0.01, 0.0, follow)
+        self._slider("time", "time (s)", follow, 0.0, max(trajectory.duration, 0.01), 0.01, 0.0)
         follow(0.0)
 
-    # ------------------------------------------------------------------ controls
+    def _add(self, kind: str, path: str, *content: Any, **style: Any) -> None:
+        self.nodes[path] = getattr(self.server.scene, f"add_{kind}")(path, *content, **style)
+
+    def _cleared(self, prefix: str, box: str) -> dict[str, Any]:
+        """Remove nodes; return whether those that take their place are visible, as a style."""
+        for path in [path for path in self.nodes if path.startswith(prefix)]:
+            self.nodes.pop(path).remove()
+        return {"visible": self.controls[box].value}
+
     def _slider(
-        self, name: str, low: float, high: float, step: float, value: float,
-        changed: Callable[[float], None],
-    ) -> None:  # fmt: skip
-        unit = {"entropy": " at least (nats)", "height": " of the slice (m)", "time": " (s)",
-                "level": ": P(occupied)"}.get(name, "")  # fmt: skip
-        slider = self.server.gui.add_slider(name + unit, low, high, step, value)
+        self, name: str, text: str, changed: Callable[[float], None], *bounds: float
+    ) -> None:
+        """Bounds: lowest and highest value, step, value to begin with."""
+        slider = self.server.gui.add_slider(text, *bounds)
         slider.on_update(lambda event: changed(float(slider.value)))
         self.controls[name] = slider
 
@@ -316,12 +338,21 @@ class Viewer:
         box.on_update(switch)
         self.controls[name] = box
 
-    def _wanted(self, box: str) -> bool:
-        return bool(self.controls[box].value)
 
-    def _remove(self, prefix: str) -> None:
-        for path in [path for path in self.nodes if path.startswith(prefix)]:
-            self.nodes.pop(path).remove()
+def _bytes(color: Float[np.ndarray, "3"]) -> tuple[int, ...]:
+    return tuple(round(255 * float(c)) for c in np.clip(color, 0.0, 1.0))
+
+
+def _arrays(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces as viser wants them."""
+    return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32)
+
+
+def _quaternion(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:
+    """The rotation of a pose, scalar first."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))
 
 
 def require_viser() -> None:
@@ -336,15 +367,6 @@ def require_viser() -> None:
         raise MissingDependencyError(
             "the viewer needs viser, which is not installed: pip install 'vprism_plan[viewer]'"
         ) from error
-
-
-def _start(host: str, port: int) -> Any:
-    """Return a running server; it takes another port if that one is busy."""
-    require_viser()
-    import viser
-
-    with _silence():
-        return viser.ViserServer(host=host, port=port, label="vprism_plan", verbose=False)
 
 
 def _silence() -> contextlib.redirect_stdout:
