@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pinhole camera geometry: pixels and depth to points, points to pixels; noise, distortion.
 
-Conventions: the camera frame is the optical one (x right, y down, z forward);
-depth is measured along z, in metres; pixel (u, v) = (column, row), and a whole
-number is the *centre* of a pixel (OpenCV).
+The camera frame is the optical one (x right, y down, z forward); depth is measured along z, in
+metres; pixel (u, v) = (column, row), and a whole number is the *centre* of a pixel (OpenCV).
 """
 
 import numpy as np
@@ -24,10 +23,8 @@ Indices = Int[np.ndarray, " n"]
 
 
 def pixel_rays(shape: tuple[int, int], intrinsics: Matrix) -> PointImage:
-    """Return, for every pixel, the point of its ray at depth z = 1 (camera frame, metres).
+    """Return, for every pixel, the point of its ray at depth z = 1 (camera frame, metres)."""
 
-    Multiply by depth to get points; the rays are *not* of unit length.
-    """
     height, width = shape
     rays = np.ones((height, width, 3))
     rays[..., 0] = (np.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
@@ -88,7 +85,45 @@ def invert_transform(transform: Pose) -> Pose:
     return inverse
 
 
+# ------------------------------------------------------------------------------------- robots
+def within_balls(points: Points, balls: Float[np.ndarray, "s 4"]) -> Chosen:
+    """Whether each point lies in a ball, its surface included.
+
+    A point is in a ball of radius r about c if |x - c|^2 + (R^2 - r^2) <= R^2: a nearest
+    neighbour search in four dimensions, with the root of R^2 - r^2 as the fourth, answers that
+    for all balls with radii up to R at once. Balls are taken by size, down to half of R
+    together, so that the fourth coordinate does not outweigh the others.
+
+    Args:
+        points: metres; what is not finite is in no ball.
+        balls: rows (x, y, z, radius), metres; a radius below 0 holds nothing.
+    """
+    from scipy.spatial import cKDTree
+
+    inside = np.zeros(len(points), dtype=bool)
+    left = np.flatnonzero(np.isfinite(points).all(axis=1))
+    balls = balls[balls[:, 3] >= 0.0]
+    balls = balls[np.argsort(-balls[:, 3], kind="stable")]
+    while len(balls) and len(left):
+        radius = float(balls[0, 3])
+        count = int((balls[:, 3] >= 0.5 * radius).sum())
+        group, balls = balls[:count], balls[count:]
+        low = (group[:, :3] - group[:, 3:]).min(axis=0)
+        high = (group[:, :3] + group[:, 3:]).max(axis=0)
+        near = left[((points[left] >= low) & (points[left] <= high)).all(axis=1)]
+        lifted = np.column_stack([group[:, :3], np.sqrt(radius**2 - group[:, 3] ** 2)])
+        asked = np.column_stack([points[near], np.zeros(len(near))])
+        # The bound of the search is exclusive, and roots round.
+        away, _ = cKDTree(lifted).query(asked, distance_upper_bound=radius * (1.0 + 1e-9) + 1e-12)
+        inside[near[np.isfinite(away)]] = True
+        left = left[~inside[left]]
+    return inside
+
+
 # -------------------------------------------------------------------------------------- noise
+# Three curves on purpose: what is certain must rest on a measured model (`depth_sigma`), while
+# clusters are cut (`stereo_noise`) and planes gathered (`inlier_band`) generously, so that the
+# worst of the cameras in use does not tear a surface apart.
 def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
 
@@ -110,9 +145,9 @@ def inlier_band(
 ) -> Float[np.ndarray, "*shape"]:
     """Half-width (metres) of the band in which a point at this depth counts as on a plane.
 
-    Stereo noise grows with the square of depth: `threshold` up to 1 m, beyond it
-    `threshold * depth^2`, and from 2 m on `4 * threshold`, or else a band at 5 m would
-    take in the table and the floor under it.
+    Several times the noise, as a table is not flat: `threshold` up to 1 m, beyond it
+    `threshold * depth^2`, and from 2 m on `4 * threshold`, or else a band at 5 m would take in
+    the table and the floor under it.
     """
     return np.asarray(threshold * np.clip(np.asarray(depth, dtype=np.float64), 1.0, 2.0) ** 2)
 

@@ -6,11 +6,20 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Float, Int32
 
+from vprism_plan._arguments import number, rigid_pose
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.balls import within_balls
-from vprism_plan.perception.camera import backproject, point_image
+from vprism_plan.perception.camera import (
+    Pixels,
+    PointImage,
+    Points,
+    Pose,
+    Vector,
+    backproject,
+    point_image,
+    within_balls,
+)
 from vprism_plan.perception.plane import Plane
 
 # Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.
@@ -23,7 +32,7 @@ MIN_MEDIAN_DEPTH = 0.005
 _USABLE_SHARE = 0.05
 # What np.nan_to_num writes for infinity in single precision; no depth is as large.
 _INFINITE = float(np.finfo(np.float32).max)
-_RIGID_TOLERANCE = 1e-3
+_RIGID = 1e-3  # by how much a rotation may be off orthonormal
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +77,7 @@ class Observation:
     max_range: float = DEFAULT_MAX_RANGE
 
     def __post_init__(self) -> None:
-        max_range = check_max_range(self.max_range)
+        max_range = number("max_range", self.max_range, 0.0, above=True, error=ObservationError)
         depth, found = check_depth(self.depth, max_range)
         checked: dict[str, Any] = {
             "max_range": max_range,
@@ -100,17 +109,17 @@ class Observation:
         return self.T_world_camera is not None
 
     @property
-    def pose(self) -> Float[np.ndarray, "4 4"]:
+    def pose(self) -> Pose:
         """Camera-to-world transform; the identity if unposed."""
         return np.eye(4) if self.T_world_camera is None else self.T_world_camera.copy()
 
     @property
-    def camera_center(self) -> Float[np.ndarray, " 3"]:
+    def camera_center(self) -> Vector:
         """Optical centre in the world frame, metres."""
         return self.pose[:3, 3]
 
     @cached_property
-    def sees_robot(self) -> Bool[np.ndarray, "h w"]:
+    def sees_robot(self) -> Pixels:
         """Pixels without a label whose point lies in one of `robot_spheres`.
 
         What they see is neither an object nor background: it moves. The ray up to it is
@@ -157,15 +166,14 @@ class Observation:
             )
         return self.object_ids
 
-    def point_image(self) -> Float[np.ndarray, "h w 3"]:
+    def point_image(self) -> PointImage:
         """World point (metres) behind every pixel, NaN where there is no return."""
         return point_image(self.depth, self.intrinsics, self.pose)
 
-    def points(self) -> tuple[Float[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]:
+    def points(self) -> tuple[Points, Int32[np.ndarray, " n"]]:
         """World points (metres) of the pixels with a return, row by row, and their labels.
 
-        Labels are all 0 if the observation is not segmented. Points of the robot
-        (`sees_robot`) are among them, with label 0.
+        Labels are all 0 if the observation is not segmented. Points of the robot are among them.
         """
         valid = self.depth > 0
         points = self.point_image()[valid]
@@ -183,19 +191,10 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
         array = np.array(value)
     except (ValueError, TypeError) as error:
         raise ObservationError(f"{name} is not an array: {error}") from error
-    if array.dtype == object:
-        raise ObservationError(
-            f"{name} holds Python objects ({type(value).__name__}); give a numeric array"
-        )
+    if array.dtype.kind not in "biuf":
+        kind = "Python objects" if array.dtype == object else array.dtype
+        raise ObservationError(f"{name} holds {kind} ({type(value).__name__}); give numbers")
     return array
-
-
-def check_max_range(value: Any) -> float:
-    """Return the farthest depth that counts as a return, metres."""
-    is_number = isinstance(value, int | float | np.integer | np.floating)
-    if not is_number or isinstance(value, bool) or not (np.isfinite(value) and value > 0):
-        raise ObservationError(f"max_range is {value!r}; it must be a positive number of metres")
-    return float(value)
 
 
 def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -207,13 +206,11 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
     depth = to_numpy(value, "depth")
     if depth.ndim != 2 or 0 in depth.shape:
         raise ObservationError(f"depth has shape {depth.shape}; it must be one image (H, W)")
-    if depth.dtype.kind in "iub":
+    if depth.dtype.kind != "f":
         raise ObservationError(
             f"depth is {depth.dtype}, so it holds raw sensor units; give metres as float: "
             "depth * scale (0.001 for millimetres)"
         )
-    if depth.dtype.kind != "f":
-        raise ObservationError(f"depth is {depth.dtype}; it must be float32 or float64 metres")
     if depth.dtype not in (np.float32, np.float64):
         depth = depth.astype(np.float32 if depth.dtype.itemsize <= 4 else np.float64)
     negative = depth < 0
@@ -291,29 +288,22 @@ def check_labels(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.ascontiguousarray(labels, dtype=np.int32)
 
 
-def _finite_matrix(value: Any, name: str, size: int, what: str) -> np.ndarray:
-    """Return a square, finite float64 matrix whose last row is that of an identity."""
-    matrix = to_numpy(value, name)
-    if matrix.shape != (size, size) or matrix.dtype.kind not in "fiu":
+def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a (3, 3) float64 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
+    matrix = to_numpy(value, "intrinsics")
+    if matrix.shape != (3, 3):
         raise ObservationError(
-            f"{name}: shape {matrix.shape} and type {matrix.dtype}; it must be {what}"
+            f"intrinsics have shape {matrix.shape}; they must be the 3x3 pinhole matrix "
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
         )
     matrix = matrix.astype(np.float64)
     if not np.isfinite(matrix).all():
-        raise ObservationError(f"{name}: not finite: {matrix.tolist()}")
-    last = np.eye(size)[-1].astype(int).tolist()
-    if not np.allclose(matrix[-1], last, atol=1e-9):
+        raise ObservationError(f"intrinsics are not finite: {matrix.tolist()}")
+    if not np.allclose(matrix[-1], [0, 0, 1], atol=1e-9):
         raise ObservationError(
-            f"{name}: its last row is {matrix[-1].tolist()}; it must be {last} (is the matrix "
-            "transposed?)"
+            f"the last row of intrinsics is {matrix[-1].tolist()}; it must be [0, 0, 1] (is the "
+            "matrix transposed?)"
         )
-    return matrix
-
-
-def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a (3, 3) float64 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
-    what = "the 3x3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-    matrix = _finite_matrix(value, "intrinsics", 3, what)
     (fx, skew, cx), (other_skew, fy, cy), _ = matrix
     if fx <= 0 or fy <= 0:
         raise ObservationError(
@@ -335,22 +325,12 @@ def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return matrix
 
 
-def check_pose(value: Any) -> np.ndarray:
+def check_pose(value: Any) -> Float[np.ndarray, "4 4"]:
     """Return a rigid (4, 4) float64 transform; small rounding is removed, more is an error."""
-    what = "a 4x4 rigid transform from camera to world coordinates, or None"
-    pose = _finite_matrix(value, "T_world_camera", 4, what)
+    value = to_numpy(value, "T_world_camera")
+    pose = rigid_pose("T_world_camera", value, tolerance=_RIGID, error=ObservationError)
     rotation = pose[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > _RIGID_TOLERANCE:
-        raise ObservationError(
-            f"T_world_camera is not rigid: its rotation is off orthonormal by {error:.2g} "
-            f"(at most {_RIGID_TOLERANCE:g}); remove scale and shear"
-        )
-    if np.linalg.det(rotation) < 0:
-        raise ObservationError(
-            "T_world_camera is not rigid: its rotation mirrors (determinant -1); flip one axis"
-        )
-    if error > 1e-12:
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-12:
         u, _, vt = np.linalg.svd(rotation)
         pose[:3, :3] = u @ vt
     return pose
@@ -370,10 +350,10 @@ def check_color(value: Any, shape: tuple[int, ...]) -> np.ndarray:
 def check_robot_spheres(value: Any) -> np.ndarray:
     """Return float64 rows (x, y, z, radius) or (x, y, z, radius, free), metres."""
     spheres = to_numpy(value, "robot_spheres")
-    if spheres.ndim != 2 or spheres.shape[1] not in (4, 5) or spheres.dtype.kind not in "fiu":
+    if spheres.ndim != 2 or spheres.shape[1] not in (4, 5):
         raise ObservationError(
-            f"robot_spheres have shape {spheres.shape} and type {spheres.dtype}; they must be "
-            "rows (x, y, z, radius) or (x, y, z, radius, free) in metres, camera frame"
+            f"robot_spheres have shape {spheres.shape}; they must be rows (x, y, z, radius) or "
+            "(x, y, z, radius, free) in metres, camera frame"
         )
     spheres = spheres.astype(np.float64)
     radii = spheres[:, 3:]

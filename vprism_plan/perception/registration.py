@@ -4,13 +4,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.perception.camera import (
     Chosen,
     Image,
+    Indices,
     Matrix,
     Points,
     Pose,
@@ -24,18 +24,14 @@ from vprism_plan.perception.camera import (
 )
 from vprism_plan.perception.observation import Observation
 
-# Samples: pixels on smooth surfaces.
-_OBJECT_SAMPLES, _OTHER_SAMPLES = 1500, 700
-_STEP = 2  # pixels between the 5 x 5 that make a normal
-_NEEDED = 13  # of the 25
+_OBJECT_SAMPLES, _OTHER_SAMPLES = 1500, 700  # pixels on smooth surfaces
+_STEP, _NEEDED = 2, 13  # pixels between the 5 x 5 that make a normal, and how many of the 25
 _STEEP = 1.5  # metres of depth per metre across, of a surface that has a normal
 _AROUND = 7  # pixels: beside an outline, the nearest of these is what a point is in front of
 
-# Laying one view on another.
 _WIDE, _NARROW = (0.06, 0.01), (0.03, 0.006)  # metres: gate and kernel, at first and later
 _EARLY, _STEPS = 5, 12
-_SHIFT = 0.05  # prior: what nothing shows stays as it was said
-_TURN = np.radians(2.0)
+_SHIFT, _TURN = 0.05, np.radians(2.0)  # prior: what nothing shows stays as it was said
 _FACING = 0.25  # cosine between a normal and the way to a camera that may see its surface
 _CORRELATED = 5.0  # neighbours share their noise: 25 samples count as one
 _NOISY = 2.0  # times the sensor's noise: mean distance of objects that are not yet one
@@ -44,26 +40,16 @@ _ELSEWHERE = 0.03  # metres
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What one view offers for a comparison.
-
-    Attributes:
-        view: the observation.
-        pose: of its camera, as it is posed or laid on another view.
-        depth: (H, W) metres, 0 where nothing or the robot was seen.
-        nearest: (H, W) least depth around each pixel, 0 where one has none.
-        points, normals: (N, 3) of smooth surfaces, world; normals face the camera.
-        ids: (N,) their labels.
-        noise: (N,) standard deviation of their depth, metres.
-    """
+    """What one view offers for a comparison."""
 
     view: Observation
-    pose: Pose
-    depth: Image
-    nearest: Image
-    points: Points
-    normals: Points
-    ids: Int[np.ndarray, " n"]
-    noise: Values
+    pose: Pose  # of its camera, as it is posed or laid on another view
+    depth: Image  # metres, 0 where nothing or the robot was seen
+    nearest: Image  # least depth around each pixel, 0 where one has none
+    points: Points  # of smooth surfaces, world
+    normals: Points  # facing the camera
+    ids: Indices  # their labels
+    noise: Values  # standard deviation of their depth, metres
 
     def of(self, chosen: Chosen) -> "Samples":
         """Return the same with some of the samples only."""
@@ -85,19 +71,12 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The rigid motion that lays one view on another.
-
-    Attributes:
-        T: (4, 4), world.
-        shift: (3,) what the middle of the view's objects moves by, metres.
-        covariance: (3, 3) of the shift.
-        count: pairs of samples it rests on.
-    """
+    """The rigid motion that lays one view on another, world frame."""
 
     T: Pose
-    shift: Vector
-    covariance: Matrix
-    count: int
+    shift: Vector  # what the middle of the view's objects moves by, metres
+    covariance: Matrix  # of the shift
+    count: int  # pairs of samples it rests on
 
     @property
     def offset(self) -> float:
@@ -107,31 +86,20 @@ class Motion:
     def certain(self, count: int, sigmas: float) -> bool:
         """Whether it rests on enough pairs, and is larger than its standard deviations."""
         way = self.shift / max(self.offset, 1e-12)
-        return self.count >= count and bool(
-            self.offset > sigmas * np.sqrt(way @ self.covariance @ way)
-        )
+        deviation = np.sqrt(way @ self.covariance @ way)
+        return self.count >= count and bool(self.offset > sigmas * deviation)
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a view shows at the pixels onto which the samples of another fall.
+    """What a view shows at the pixels onto which the samples of another fall."""
 
-    Attributes:
-        surface: (N, 3) the point that the pixel shows, world.
-        labels: of the pixel.
-        gap: how far the surface lies along the sample's normal, metres.
-        away: how far it lies at all; infinite where there is no return, or the sample's
-            surface faces away.
-        free: how far the sample lies before the nearest return around the pixel, metres.
-        noise: of depth there, metres.
-    """
-
-    surface: Points
-    labels: Int[np.ndarray, " n"]
-    gap: Values
-    away: Values
-    free: Values
-    noise: Values
+    surface: Points  # what the pixel shows, world
+    labels: Indices  # of the pixel
+    gap: Values  # how far the surface lies along the sample's normal, metres
+    away: Values  # how far it lies at all; infinite without a return, or if the sample faces away
+    free: Values  # how far the sample lies before the nearest return around the pixel, metres
+    noise: Values  # of depth there, metres
 
     def same(self, gate: float) -> Chosen:
         """Which samples may be of the surface that is seen there."""
@@ -146,9 +114,9 @@ class Look:
 def samples_of(view: Observation) -> Samples:
     """Return evenly spread samples of a view, more of its objects than of the rest."""
     depth = np.where(view.sees_robot, 0.0, view.depth).astype(np.float64)
-    margin = 2 * _STEP
     inner = np.zeros(view.shape, dtype=bool)
-    inner[margin:-margin, margin:-margin] = depth[margin:-margin, margin:-margin] > 0
+    middle = (slice(2 * _STEP, -2 * _STEP),) * 2
+    inner[middle] = depth[middle] > 0
     objects, others = (
         np.flatnonzero(inner & own)[:: max(1, int((inner & own).sum()) // count)]
         for own, count in ((view.labels > 0, _OBJECT_SAMPLES), (view.labels == 0, _OTHER_SAMPLES))
@@ -156,26 +124,16 @@ def samples_of(view: Observation) -> Samples:
     row, column = np.divmod(np.concatenate([objects, others]), view.shape[1])
     points, normals, smooth = _normals(depth, view.intrinsics, row, column)
     nearest = ndimage.minimum_filter(depth.astype(np.float32), _AROUND, mode="nearest")
-    samples = Samples(
-        view,
-        np.eye(4),
-        depth,
-        nearest.astype(np.float64),
-        points,
-        normals,
-        view.labels[row, column],
-        depth_sigma(points[:, 2]),
-    )
+    images = (depth, nearest.astype(np.float64))
+    ids, noise = view.labels[row, column], depth_sigma(points[:, 2])
+    samples = Samples(view, np.eye(4), *images, points, normals, ids, noise)
     return samples.of(smooth).moved(view.pose)
 
 
 def _normals(
-    depth: Image, intrinsics: Matrix, row: Int[np.ndarray, " n"], column: Int[np.ndarray, " n"]
+    depth: Image, intrinsics: Matrix, row: Indices, column: Indices
 ) -> tuple[Points, Points, Chosen]:
-    """Fit planes to the pixels around some; return points, normals (camera frame), and which fit.
-
-    A pixel at an edge has no plane within the sensor's noise.
-    """
+    """Centres and normals (camera frame) of planes through the pixels around some; which fit."""
     down, right = _STEP * (np.indices((5, 5)).reshape(2, 25) - 2)
     around = lift(depth, intrinsics, row[:, None] + down, column[:, None] + right)
     middle = depth[row, column]
@@ -220,15 +178,9 @@ def lay(
     """Return the motion that lays one view's surfaces on the other's.
 
     Point-to-plane iterated closest points (Chen and Medioni, 1992), partners by projection,
-    both ways, with a robust kernel. What the surfaces do not show stays as it is: the motion
-    has a prior of two degrees and 5 cm.
-
-    Args:
-        moving: the view that is moved.
-        fixed: the view that it is laid on.
-        steps: iterations at most.
-        early: of these, how many look farther.
-        turn: standard deviation of the prior, radians.
+    both ways, with a robust kernel, in at most `steps` iterations, of which the `early` ones
+    look farther. What the surfaces do not show stays as it is: the motion has a prior, with
+    standard deviations of `turn` radians and 5 cm.
     """
     center, strayed, T = moving.center, np.zeros(6), np.eye(4)
     prior = np.diag([turn**-2.0] * 3 + [_SHIFT**-2.0] * 3)
@@ -257,8 +209,7 @@ def lay(
 def explained(new: Samples, known: Samples) -> Motion:
     """Return the motion of a view, or none, that leaves its objects nearest to the other's.
 
-    Distances count, not their squares: if one of three objects was moved, laying the view on
-    the other spreads its way over all of them.
+    Distances count, not squares, which spread the way of one object that moved over all.
     """
     still = Motion(np.eye(4), np.zeros(3), np.zeros((3, 3)), 0)
     options = [lay(new, known, early=_EARLY), still]
