@@ -337,7 +337,6 @@ _FEWEST_LINES, _ON_TABLE, _LINES, _EDGE = 10, 0.25, 0.35, 0.18
 
 
 @dataclass(frozen=True, eq=False)
-class MaskView@dataclass(frozen=True, eq=False)
 class MaskView:
     """A window of a view, and how its pixels lie to the support surface."""
 

@@ -206,7 +206,7 @@ def _overlooked(
 
 
 def _concentration(plane: Plane, points: Points, band: Values) -> float:
-    """Share of the points in the band in its middle half: 0.8 to 1 for a table, 0.5 for mixtures."""
+    """Share of the points in the band in its middle half: 0.8 to 1 for a table, 0.5 for a mix."""
     height = np.abs(plane.signed_distance(points)) / band
     return float((height < 0.5).sum()) / max(1, int((height < 1.0).sum()))
 

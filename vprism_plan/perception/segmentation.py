@@ -314,12 +314,7 @@ def _split_at_valleys(
 
 
 def _fall_apart(
-    members: Indices,
-    height: Values,
-    area: Values,
-    start: Indices,
-    end: Indices,
-    min_area: float,
+    members: Indices, height: Values, area: Values, start: Indices, end: Indices, min_area: float
 ) -> list[np.ndarray]:
     """Raise the water until two or more prominent pieces are left; [] if that never happens."""
     heights = height[members]

@@ -154,7 +154,7 @@ def ignore_self(
     if not hasattr(robot, "solid_balls"):
         return ignore_robot(
             observation, centers, robot.sphere_radii, padding,
-            room=room or 0.0, remove_flying=remove_flying,
+            room=room or 0.0, remove_flying=remove_flying
         )  # fmt: skip
     solid = robot.solid_balls(q)
     said: list[str] = []

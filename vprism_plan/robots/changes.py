@@ -11,10 +11,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import read_triangles
+from vprism_plan.robots.geometry import (
+    Pairs,
+    Points,
+    Spheres,
+    Triangles,
+    Values,
+    Vector,
+    read_triangles,
+)
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,
@@ -68,9 +76,7 @@ def padded(
     )
 
 
-def _with_pairs(
-    arrays: KinematicArrays, added: Sequence[Sequence[int]]
-) -> Int[np.ndarray, "pairs 2"]:
+def _with_pairs(arrays: KinematicArrays, added: Sequence[Sequence[int]]) -> Pairs:
     """The pairs that are tested, with others added; sorted."""
     both = np.vstack([arrays.pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
     return np.ascontiguousarray(both[np.lexsort((both[:, 1], both[:, 0]))])
@@ -111,9 +117,7 @@ def _allowed(value: float, what: str, whose: str) -> float:
 
 
 def grown(
-    arrays: KinematicArrays,
-    scale: Float[np.ndarray, "links"],
-    padding: Float[np.ndarray, "links"],
+    arrays: KinematicArrays, scale: Float[np.ndarray, "links"], padding: Float[np.ndarray, "links"]
 ) -> KinematicArrays:
     """Scale the spheres of each link about the centre of its bounding ball, then pad them.
 
@@ -145,12 +149,7 @@ def grown(
     )
 
 
-def _scaled(
-    centers: Float[np.ndarray, "n 3"],
-    radii: Float[np.ndarray, "n"],
-    about: Float[np.ndarray, "3"],
-    factor: float,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+def _scaled(centers: Points, radii: Values, about: Vector, factor: float) -> tuple[Points, Values]:
     arm = centers - about
     image, big = about + factor * arm, factor * radii * (1.0 + 1e-12)
     if factor <= 1.0:
@@ -173,10 +172,10 @@ class Held:
         surface: the triangles of its mesh, if one was given.
     """
 
-    spheres: Float[np.ndarray, "n 4"]
-    surface: Float[np.ndarray, "f 3 3"] | None = None
+    spheres: Spheres
+    surface: Triangles | None = None
 
-    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+    def triangles(self) -> Triangles:
         """As of a link's `MeshFile`."""
         return np.empty((0, 3, 3)) if self.surface is None else self.surface
 
@@ -275,10 +274,7 @@ def _members(robot: Any, name: str) -> tuple[str, ...]:
 
 
 def _with_link(
-    arrays: KinematicArrays,
-    sits: Attachment,
-    rows: Float[np.ndarray, "n 4"],
-    tested: Sequence[int],
+    arrays: KinematicArrays, sits: Attachment, rows: Spheres, tested: Sequence[int]
 ) -> KinematicArrays:
     """Add a link at the end: spheres in its own frame, to be tested against some links."""
     local, radii, center, radius = in_frame(sits, rows)
@@ -299,7 +295,7 @@ def _with_link(
     )
 
 
-def _sphere_rows(spheres: object, what: str) -> Float[np.ndarray, "n 4"]:
+def _sphere_rows(spheres: object, what: str) -> Spheres:
     try:
         rows = np.array(spheres, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
@@ -27,6 +27,17 @@ _FORMATS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb", ".gltf")
 # What rounding makes of triangles without any, as a share of the extent squared.
 _NO_AREA = 1e-12
 _logger = logging.getLogger(__name__)
+
+# What this package hands around; lengths are metres, spheres rows (x, y, z, radius).
+Vector = Float[np.ndarray, "3"]
+Pose = Float[np.ndarray, "4 4"]
+Points = Float[np.ndarray, "n 3"]
+Values = Float[np.ndarray, " n"]
+Indices = Int[np.ndarray, " n"]
+Spheres = Float[np.ndarray, "n 4"]
+Triangles = Float[np.ndarray, "f 3 3"]
+Pairs = Int[np.ndarray, "pairs 2"]
+Configurations = Float[np.ndarray, "n dof"]
 
 PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | None
 """Where packages are: folders that hold them (or are them), or package -> its folder."""
@@ -47,8 +58,8 @@ class MeshFile:
 
     link: str
     filename: str
-    scale: Float[np.ndarray, "3"]
-    T_link: Float[np.ndarray, "4 4"]
+    scale: Vector
+    T_link: Pose
     path: Path | None
     searched: tuple[str, ...] = ()
 
@@ -66,7 +77,7 @@ class MeshFile:
             )
         return self.path
 
-    def scaled(self, about: Float[np.ndarray, "3"], factor: float) -> MeshFile:
+    def scaled(self, about: Vector, factor: float) -> MeshFile:
         """The same mesh larger or smaller by a factor, about a point of the link's frame."""
         T = _moved(self.T_link, about, factor)
         return replace(self, scale=factor * self.scale, T_link=T)
@@ -100,14 +111,12 @@ class MeshFile:
                 )
             return local
 
-    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+    def triangles(self) -> Triangles:
         """Triangles in the link's frame, metres; errors as of :meth:`mesh`."""
         return np.asarray(self.mesh().triangles, dtype=np.float64)
 
 
-def _moved(
-    T_link: Float[np.ndarray, "4 4"], about: Float[np.ndarray, "3"], factor: float
-) -> Float[np.ndarray, "4 4"]:
+def _moved(T_link: Pose, about: Vector, factor: float) -> Pose:
     T = T_link.copy()
     T[:3, 3] = about + factor * (T[:3, 3] - about)
     return T
@@ -207,10 +216,10 @@ class PrimitiveGeometry:
 
     kind: Literal["box", "cylinder", "sphere"]
     size: tuple[float, ...]
-    T_link: Float[np.ndarray, "4 4"]
+    T_link: Pose
     padding: float = 0.0
 
-    def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def signed_distance(self, points: Points) -> Values:
         """Exact signed distance of points to the solid.
 
         Args:
@@ -231,7 +240,7 @@ class PrimitiveGeometry:
         outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
         return outside + np.minimum(excess.max(axis=1), 0.0) - self.padding
 
-    def triangles(self, sides: int = 32) -> Float[np.ndarray, "f 3 3"]:
+    def triangles(self, sides: int = 32) -> Triangles:
         """A closed surface around the solid without its padding, link frame, metres.
 
         Exact for a box. A cylinder becomes a prism around it, a sphere a polyhedron around
@@ -255,9 +264,7 @@ class PrimitiveGeometry:
         local = np.asarray(mesh.triangles, dtype=np.float64)
         return local @ self.T_link[:3, :3].T + self.T_link[:3, 3]
 
-    def grown(
-        self, about: Float[np.ndarray, "3"], factor: float, padding: float
-    ) -> PrimitiveGeometry:
+    def grown(self, about: Vector, factor: float, padding: float) -> PrimitiveGeometry:
         """The solid scaled about a point of the link's frame, then padded."""
         T, size = _moved(self.T_link, about, factor), tuple(factor * edge for edge in self.size)
         return PrimitiveGeometry(self.kind, size, T, factor * self.padding + padding)
@@ -296,9 +303,7 @@ def read_scene(path: Path) -> Any:
     return scene
 
 
-def read_triangles(
-    mesh: Any, what: str, max_extent: float = _LONGEST_OBJECT
-) -> Float[np.ndarray, "f 3 3"]:
+def read_triangles(mesh: Any, what: str, max_extent: float = _LONGEST_OBJECT) -> Triangles:
     """Triangles of a mesh or of a mesh file, metres.
 
     Raises:

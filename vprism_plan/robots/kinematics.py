@@ -13,6 +13,15 @@ from numpy.typing import ArrayLike
 
 from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import (
+    Configurations,
+    Indices,
+    Points,
+    Pose,
+    Spheres,
+    Values,
+    Vector,
+)
 from vprism_plan.robots.sphere_files import LinkSpheres
 from vprism_plan.robots.urdf import RobotModel
 
@@ -110,7 +119,7 @@ class Attachment:
 
 
 def rotation(
-    axis: Float[np.ndarray, "3"], angle: Float[np.ndarray, "*batch"] | np.float64
+    axis: Vector, angle: Float[np.ndarray, "*batch"] | np.float64
 ) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices about a unit axis (Rodrigues)."""
     x, y, z = axis
@@ -124,7 +133,7 @@ def build_arrays(
     active: Sequence[str],
     locked: Mapping[str, float],
     spheres: LinkSpheres,
-    base_pose: Float[np.ndarray, "4 4"],
+    base_pose: Pose,
 ) -> tuple[KinematicArrays, dict[str, Attachment]]:
     """Flatten a robot into arrays without pairs, and say where each URDF link sits.
 
@@ -184,9 +193,7 @@ def _ints(values: object) -> np.ndarray:
     return np.array(values, dtype=np.int64, order="C")
 
 
-def in_frame(
-    sits: Attachment, rows: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "3"], float]:
+def in_frame(sits: Attachment, rows: Spheres) -> tuple[Points, Values, Vector, float]:
     """A link's spheres in the frame that it moves with, radius falling, and a ball around them."""
     rows = rows[np.argsort(-rows[:, 3], kind="stable")]
     local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
@@ -213,9 +220,7 @@ def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dic
     }
 
 
-def bounding_ball(
-    centers: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]
-) -> tuple[Float[np.ndarray, "3"], float]:
+def bounding_ball(centers: Points, radii: Values) -> tuple[Vector, float]:
     """A small ball that holds a set of balls (Badoiu and Clarkson's iteration).
 
     Returns:
@@ -237,7 +242,7 @@ def bounding_ball(
 
 
 def frame_poses(
-    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"]
+    arrays: KinematicArrays, q: Configurations
 ) -> tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]]:
     """World poses of all frames for a batch of configurations (radians or metres): rotations
     and positions."""
@@ -258,15 +263,15 @@ def frame_poses(
 
 def place(
     poses: tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]],
-    frame: Int[np.ndarray, "m"],
-    points: Float[np.ndarray, "m 3"],
+    frame: Indices,
+    points: Points,
 ) -> Float[np.ndarray, "n m 3"]:
     """World positions of points that move with frames, from :func:`frame_poses`."""
     R, t = poses
     return np.asarray((R[:, frame] @ points[:, :, None])[..., 0] + t[:, frame])
 
 
-def only_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+def only_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
     """Spheres of these links only, in this order; all joints, and no pairs."""
     counts = np.diff(arrays.link_start)[links]
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -399,7 +404,7 @@ def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]
         ) from error
 
 
-def rigid_pose(pose: ArrayLike, what: str = "base_pose") -> Float[np.ndarray, "4 4"]:
+def rigid_pose(pose: ArrayLike, what: str = "base_pose") -> Pose:
     """A copy of a pose, refused unless it is a proper rigid motion."""
     try:
         T = np.array(pose, dtype=np.float64)

@@ -9,9 +9,10 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import Configurations, Indices, Pairs
 from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
 from vprism_plan.robots.spheres import ChosenSpheres
 from vprism_plan.robots.srdf import RIGID
@@ -33,7 +34,7 @@ def choose_pairs(
     chosen: ChosenSpheres,
     stated: Mapping[frozenset[str], str] | None,
     samples: int,
-) -> tuple[Int[np.ndarray, "pairs 2"], dict[frozenset[str], str], dict[frozenset[str], str]]:
+) -> tuple[Pairs, dict[frozenset[str], str], dict[frozenset[str], str]]:
     """Which pairs of links are tested: all but adjacent, rigid and disabled ones, and those that
     random configurations show to need no test.
 
@@ -87,7 +88,7 @@ def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
 
 
 def _touching_fits(
-    arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"], chosen: ChosenSpheres
+    arrays: KinematicArrays, pairs: Pairs, chosen: ChosenSpheres
 ) -> dict[frozenset[str], str]:
     """Pairs that an SRDF wants tested, and whose fitted spheres overlap in every pose."""
     names = tuple(chosen.rows)
@@ -117,10 +118,7 @@ def hangs_on(model: RobotModel, joints: Collection[str], pair: frozenset[str]) -
 
 
 def sampled_reasons(
-    arrays: KinematicArrays,
-    pairs: Int[np.ndarray, "pairs 2"],
-    names: Sequence[str],
-    samples: int,
+    arrays: KinematicArrays, pairs: Pairs, names: Sequence[str], samples: int
 ) -> dict[frozenset[str], str]:
     """Pairs that overlap always, and pairs that never come near each other.
 
@@ -154,16 +152,12 @@ def sampled_reasons(
     return _named(pairs[always], names, ALWAYS) | _named(pairs[far], names, NEVER)
 
 
-def _named(
-    pairs: Int[np.ndarray, "pairs 2"], names: Sequence[str], reason: str
-) -> dict[frozenset[str], str]:
+def _named(pairs: Pairs, names: Sequence[str], reason: str) -> dict[frozenset[str], str]:
     return {frozenset((names[a], names[b])): reason for a, b in pairs}
 
 
 def pair_gaps(
-    arrays: KinematicArrays,
-    q: Float[np.ndarray, "n dof"],
-    pairs: Int[np.ndarray, "pairs 2"],
+    arrays: KinematicArrays, q: Configurations, pairs: Pairs
 ) -> Float[np.ndarray, "n pairs"]:
     """Distance between the spheres of two links in each configuration, padding not counted.
 
@@ -187,7 +181,7 @@ def pair_gaps(
 def _least_gaps(
     arrays: KinematicArrays,
     starts: Float[np.ndarray, "pairs starts dof"],
-    pairs: Int[np.ndarray, "pairs 2"],
+    pairs: Pairs,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "pairs"]:
     """The smallest gaps that random steps downhill from these configurations lead to."""
@@ -208,7 +202,7 @@ def _least_gaps(
     return least
 
 
-def _of_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+def _of_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
     """Only these links, in this order, and the joints that move them; q stays as it was."""
     frames: set[int] = {0}
     for link in links:
@@ -233,7 +227,7 @@ def _of_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> Kinematic
 
 
 def pairs_touching(
-    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"], pairs: Int[np.ndarray, "pairs 2"]
+    arrays: KinematicArrays, q: Configurations, pairs: Pairs
 ) -> Bool[np.ndarray, "n pairs"]:
     """For each configuration and link pair, whether any of their spheres overlap, padding
     not counted."""
@@ -262,7 +256,7 @@ def touching_shares(
 
 def random_configurations(
     arrays: KinematicArrays, n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "n dof"]:
+) -> Configurations:
     """Uniform configurations within the limits."""
     return rng.uniform(arrays.lower, arrays.upper, size=(n, len(arrays.lower)))
 

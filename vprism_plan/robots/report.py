@@ -9,9 +9,15 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
+from vprism_plan.robots.geometry import (
+    MeshFile,
+    Points,
+    PrimitiveGeometry,
+    Spheres,
+    Triangles,
+    Values,
+)
 from vprism_plan.robots.surfaces import (
     Surface,
     halved_triangles,
@@ -229,7 +235,7 @@ _ON_SPHERE = 200
 _ROWS = 20_000
 
 
-def enclosed(triangles: Float[np.ndarray, "f 3 3"], spheres: Float[np.ndarray, "n 4"]) -> bool:
+def enclosed(triangles: Triangles, spheres: Spheres) -> bool:
     """Whether every point of a surface lies in the union of spheres: a proof, no sampling.
 
     A triangle whose corners lie in one sphere lies in it. Others are halved, until all do
@@ -254,9 +260,7 @@ def enclosed(triangles: Float[np.ndarray, "f 3 3"], spheres: Float[np.ndarray, "
     return True
 
 
-def sphere_gap(
-    points: Float[np.ndarray, "n 3"], spheres: Float[np.ndarray, "m 4"]
-) -> Float[np.ndarray, "n"]:
+def sphere_gap(points: Points, spheres: Spheres) -> Values:
     """Signed distance of points to the union of spheres, metres: negative inside."""
     gap = np.full(len(points), math.inf)
     for *centre, radius in spheres:
@@ -265,9 +269,7 @@ def sphere_gap(
 
 
 def protrusion(
-    primitives: Sequence[PrimitiveGeometry],
-    triangles: Float[np.ndarray, "f 3 3"] | None,
-    spheres: Float[np.ndarray, "n 4"],
+    primitives: Sequence[PrimitiveGeometry], triangles: Triangles | None, spheres: Spheres
 ) -> tuple[float, float]:
     """How far the union of spheres stands out of a link at most, and on average, metres.
 
@@ -288,7 +290,7 @@ def protrusion(
     return float(away.max()), float(away.mean())
 
 
-def _outer_points(spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
+def _outer_points(spheres: Spheres) -> Points:
     """Points of the union's surface."""
     i = np.arange(_ON_SPHERE) + 0.5
     height, turn = 1.0 - 2.0 * i / _ON_SPHERE, math.pi * (1.0 + math.sqrt(5.0)) * i
@@ -298,9 +300,7 @@ def _outer_points(spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]
     return points[sphere_gap(points, spheres) > -1e-9]
 
 
-def _mesh_distance(
-    triangles: Float[np.ndarray, "f 3 3"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n"]:
+def _mesh_distance(triangles: Triangles, points: Points) -> Values:
     """Distance to a surface, 0 where the surface encloses the point."""
     from scipy.spatial import cKDTree
 

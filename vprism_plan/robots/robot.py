@@ -20,7 +20,7 @@ from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import changes, pairs, solid_balls
 from vprism_plan.robots.changes import Held
-from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
+from vprism_plan.robots.geometry import MeshFile, PackageDirs, Pairs, Pose, PrimitiveGeometry
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,
@@ -87,7 +87,7 @@ class Robot:
     joint_names: tuple[str, ...]
     locked: dict[str, float]
     velocity_limits: Float[np.ndarray, "dof"]
-    base_pose: Float[np.ndarray, "4 4"]
+    base_pose: Pose
     link_names: tuple[str, ...]
     geometry: dict[str, tuple[PrimitiveGeometry, ...]]
     named_states: dict[str, np.ndarray]
@@ -241,7 +241,7 @@ class Robot:
         return self.arrays.sphere_link
 
     @property
-    def collision_pairs(self) -> Int[np.ndarray, "pairs 2"]:
+    def collision_pairs(self) -> Pairs:
         """Link pairs to test for self-collision, indices into ``link_names``."""
         return self.arrays.pairs
 

@@ -15,10 +15,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import PrimitiveGeometry
+from vprism_plan.robots.geometry import Points, Pose, PrimitiveGeometry, Spheres, Triangles, Values
 from vprism_plan.robots.surfaces import Surface, split_triangles
 
 # Metres between centres, and by how much balls may fall short of such a point. Together: some
@@ -40,8 +39,8 @@ class SolidBalls:
         without: names of these links.
     """
 
-    inner: Float[np.ndarray, "n 4"]
-    spheres: Float[np.ndarray, "m 4"]
+    inner: Spheres
+    spheres: Spheres
     without: tuple[str, ...]
 
 
@@ -65,14 +64,12 @@ def solid_balls(robot: Any, q: Any) -> SolidBalls:
     return SolidBalls(np.concatenate(inner), np.concatenate(spheres), tuple(without))
 
 
-def _placed(rows: Float[np.ndarray, "n 4"], pose: Float[np.ndarray, "4 4"]) -> np.ndarray:
+def _placed(rows: Spheres, pose: Pose) -> np.ndarray:
     return np.column_stack([rows[:, :3] @ pose[:3, :3].T + pose[:3, 3], rows[:, 3]])
 
 
 @lru_cache(maxsize=256)
-def inner_balls(
-    solids: tuple[PrimitiveGeometry, ...], meshes: tuple[Any, ...]
-) -> Float[np.ndarray, "n 4"]:
+def inner_balls(solids: tuple[PrimitiveGeometry, ...], meshes: tuple[Any, ...]) -> Spheres:
     """Balls inside a link's solids that together fill their union.
 
     Inside a mesh is what its surface encloses, cracks narrower than a cell (a fortieth to an
@@ -103,13 +100,13 @@ def inner_balls(
     return found
 
 
-def _of_primitive(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
+def _of_primitive(solid: PrimitiveGeometry) -> Spheres:
     """A lattice along the solid's own axes: faces, edges and corners are on it."""
     places = _lattice(solid.kind, solid.size) @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
     return np.column_stack([places, np.maximum(-solid.signed_distance(places), 0.0)])
 
 
-def _lattice(kind: str, size: Sequence[float]) -> Float[np.ndarray, "n 3"]:
+def _lattice(kind: str, size: Sequence[float]) -> Points:
     if kind == "box":
         axes = [_steps(-0.5 * edge, 0.5 * edge) for edge in size]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -123,11 +120,11 @@ def _lattice(kind: str, size: Sequence[float]) -> Float[np.ndarray, "n 3"]:
     return np.concatenate([np.insert(flat, 2, height, axis=1) for height in heights])
 
 
-def _steps(first: float, last: float) -> Float[np.ndarray, " n"]:
+def _steps(first: float, last: float) -> Values:
     return np.linspace(first, last, max(math.ceil((last - first) / _STEP), 1) + 1)
 
 
-def _of_mesh(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "n 4"]:
+def _of_mesh(triangles: Triangles) -> Spheres:
     """Points of the surface, and the middles of cells that it encloses.
 
     In triangles without an edge longer than `_STEP` every point is at most that over sqrt(3)
@@ -146,7 +143,7 @@ def _of_mesh(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "n 4"]:
     return np.concatenate([rim, np.column_stack([middles, radius])])
 
 
-def _cover(rows: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 4"]:
+def _cover(rows: Spheres) -> Spheres:
     """The balls that, up to `_SHORT`, hold all middles near the surface and a share of others.
 
     Chosen greedily: each time the ball that holds most of what is not held yet.

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import Spheres
 
 LinkSpheres = dict[str, np.ndarray]
 """Link name -> (n, 4) rows (x, y, z, radius) in the link's frame, metres."""
@@ -215,7 +215,7 @@ def _table(content: Any, source: str, off: bool) -> LinkSpheres:
     return {str(link): _rows(link, entries, source, off) for link, entries in content.items()}
 
 
-def _rows(link: str, entries: Any, source: str, off: bool) -> Float[np.ndarray, "n 4"]:
+def _rows(link: str, entries: Any, source: str, off: bool) -> Spheres:
     if entries is None:
         entries = []
     if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
@@ -240,7 +240,7 @@ def _rows(link: str, entries: Any, source: str, off: bool) -> Float[np.ndarray, 
 
 def write_spheres(
     path: str | Path,
-    spheres: Mapping[str, Float[np.ndarray, "n 4"]],
+    spheres: Mapping[str, Spheres],
     note: str = "",
     padding: Mapping[str, float] | None = None,
 ) -> None:

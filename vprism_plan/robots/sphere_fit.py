@@ -22,9 +22,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import Indices, Points, Spheres, Triangles, Values, Vector
 from vprism_plan.robots.surfaces import Surface, with_hull
 
 _MOST, _ARM_SIZED = 12, 0.35
@@ -75,7 +76,7 @@ class SphereFit:
             if most is not None and most < 1:
                 raise RobotError(f"max_spheres is {most}; every link needs at least 1")
 
-    def most(self, link: str, triangles: Float[np.ndarray, "f 3 3"]) -> int:
+    def most(self, link: str, triangles: Triangles) -> int:
         """Return the largest number of spheres for a link with this surface."""
         table = self.max_spheres
         most = table.get(link) if isinstance(table, Mapping) else table
@@ -83,18 +84,16 @@ class SphereFit:
             return int(most)
         return min(64, max(_MOST, math.ceil(_MOST * (_diagonal(triangles) / _ARM_SIZED) ** 2)))
 
-    def allowed(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:
+    def allowed(self, triangles: Triangles) -> float:
         """Return the metres by which a sphere may stand out of these triangles."""
         return min(self.tolerance, self.relative * _diagonal(triangles))
 
 
-def _diagonal(triangles: Float[np.ndarray, "f 3 3"]) -> float:
+def _diagonal(triangles: Triangles) -> float:
     return float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
 
 
-def fit_spheres(
-    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int
-) -> Float[np.ndarray, "n 4"]:
+def fit_spheres(triangles: Triangles, tolerance: float, max_spheres: int) -> Spheres:
     """Spheres whose union holds a surface, and what it encloses.
 
     Of the inside, the cells of a lattice (18 to 40 along the longest edge) are held that the
@@ -113,9 +112,7 @@ def fit_spheres(
     return _fit(corners.tobytes(), tolerance, max_spheres).copy()
 
 
-def hold_object(
-    triangles: Float[np.ndarray, "f 3 3"], max_spheres: int = 32
-) -> Float[np.ndarray, "n 4"]:
+def hold_object(triangles: Triangles, max_spheres: int = 32) -> Spheres:
     """As :func:`fit_spheres`, but never more than so many, and no open shell counts as solid.
 
     Figures of how far they stand out are in ``tests/robots/test_attached.py``.
@@ -131,13 +128,13 @@ def hold_object(
 
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
-def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
+def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Spheres:
     return _fitted(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance, max_spheres)
 
 
 def _fitted(
-    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int, strict: bool = False
-) -> Float[np.ndarray, "n 4"]:
+    triangles: Triangles, tolerance: float, max_spheres: int, strict: bool = False
+) -> Spheres:
     surface = Surface.of(triangles, tolerance, _MANY if strict else None)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
@@ -157,7 +154,7 @@ def _fitted(
     return _filled_up(surface, spheres, max(protrusion, 0.0) if strict else 0.0)
 
 
-def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> list[int]:
+def _smallest(reach: np.ndarray, depth: Values, count: int) -> list[int]:
     """Centres of at most `count` spheres that hold all and stand out least, by bisection."""
     alone = reach.max(axis=1) - depth
     best, low, high = [int(alone.argmin())], 0.0, float(alone.min())
@@ -171,7 +168,7 @@ def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> l
     return best
 
 
-def _candidate_cells(depth: Float[np.ndarray, "n"], most: int) -> Int[np.ndarray, "c"]:
+def _candidate_cells(depth: Values, most: int) -> Indices:
     """Cells to centre spheres on: the deepest ones and an even selection of the others."""
     if len(depth) <= most:
         return np.arange(len(depth))
@@ -180,7 +177,7 @@ def _candidate_cells(depth: Float[np.ndarray, "n"], most: int) -> Int[np.ndarray
     return np.unique(np.concatenate([deepest, spread]))
 
 
-def _greedy_cover(reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int) -> list[int] | None:
+def _greedy_cover(reach: np.ndarray, radius: Values, most: int) -> list[int] | None:
     """Choose spheres until all is held: each time the one that holds most of what is new.
 
     Returns:
@@ -202,9 +199,7 @@ def _greedy_cover(reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int) 
     return chosen
 
 
-def _settled(
-    surface: Surface, centres: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "m 4"], float]:
+def _settled(surface: Surface, centres: Points) -> tuple[Spheres, float]:
     """Move spheres until their largest protrusion stands still; return it, too."""
     centres = centres.copy()
     reach = surface.reach(centres)
@@ -226,9 +221,7 @@ def _settled(
     return _tightened(surface, centres, reach, radius)
 
 
-def _moved(
-    surface: Surface, centre: Float[np.ndarray, "3"], own: Int[np.ndarray, "k"]
-) -> Float[np.ndarray, "3"]:
+def _moved(surface: Surface, centre: Vector, own: Indices) -> Vector:
     """Where a sphere that holds these triangles stands out least, by a pattern search."""
     from scipy.spatial.distance import cdist
 
@@ -251,11 +244,8 @@ def _moved(
 
 
 def _tightened(
-    surface: Surface,
-    centres: Float[np.ndarray, "n 3"],
-    reach: Float[np.ndarray, "n t"],
-    radius: Float[np.ndarray, "n"],
-) -> tuple[Float[np.ndarray, "m 4"], float]:
+    surface: Surface, centres: Points, reach: Float[np.ndarray, "n t"], radius: Values
+) -> tuple[Spheres, float]:
     """Cut every radius to what no other sphere holds, worst first."""
     centres, reach, radius = centres.copy(), reach.copy(), radius.copy()
     kept = np.ones(len(centres), dtype=bool)
@@ -274,9 +264,7 @@ def _tightened(
     return spheres, float((radius + surface.signed(centres))[kept].max())
 
 
-def _filled_up(
-    surface: Surface, spheres: Float[np.ndarray, "n 4"], room: float
-) -> Float[np.ndarray, "m 4"]:
+def _filled_up(surface: Surface, spheres: Spheres, room: float) -> Spheres:
     """Add spheres that stand out by `room` until every cell that no surface reaches is held."""
     index = np.argwhere(surface.whole)
     middles = surface.lower + surface.cell * (index + 0.5)
@@ -294,7 +282,7 @@ def _filled_up(
 
 
 def _cells_held(
-    middles: Float[np.ndarray, "n 3"], edge: float, spheres: Float[np.ndarray, "m 4"], deep: int = 3
+    middles: Points, edge: float, spheres: Spheres, deep: int = 3
 ) -> Bool[np.ndarray, "n"]:
     """Whether cubes lie in the union of spheres: each, or each of its eighths, in one."""
     offsets = np.array(list(np.ndindex(2, 2, 2))) - 0.5

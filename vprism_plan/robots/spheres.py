@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import PrimitiveGeometry
+from vprism_plan.robots.geometry import Points, PrimitiveGeometry, Spheres
 from vprism_plan.robots.sphere_files import LinkSpheres, read_spheres
 from vprism_plan.robots.sphere_fit import SphereFit, fit_spheres
 from vprism_plan.robots.surfaces import link_triangles
@@ -138,7 +138,7 @@ def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) ->
     return ChosenSpheres(rows, sources)
 
 
-def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
+def enclosing_spheres(solid: PrimitiveGeometry) -> Spheres:
     """Spheres whose union holds a solid.
 
     A box is cut into box cells, a cylinder into slices of rings of sectors; each
@@ -162,7 +162,7 @@ def enclosing_spheres(solid: PrimitiveGeometry) -> Float[np.ndarray, "n 4"]:
     return local
 
 
-def _tile_cylinder(radius: float, length: float) -> Float[np.ndarray, "n 4"]:
+def _tile_cylinder(radius: float, length: float) -> Spheres:
     """A ball on the axis and rings of balls around it, repeated along the axis."""
     edge = _TILE_EDGE
     while True:
@@ -189,7 +189,7 @@ def _sectors(radius: float, rings: int, edge: float) -> Int[np.ndarray, "rings"]
     return np.maximum(4, np.ceil(2 * math.pi * outer / edge)).astype(np.int64)
 
 
-def _tile_disc(radius: float, rings: int, edge: float) -> Float[np.ndarray, "n 3"]:
+def _tile_disc(radius: float, rings: int, edge: float) -> Points:
     """Circles (x, y, radius) whose union holds a disc."""
     width = radius / rings
     circles = [np.array([[0.0, 0.0, width]])]
@@ -206,7 +206,7 @@ def _tile_disc(radius: float, rings: int, edge: float) -> Float[np.ndarray, "n 3
     return np.vstack(circles)
 
 
-def _tile_box(size: Sequence[float]) -> Float[np.ndarray, "n 4"]:
+def _tile_box(size: Sequence[float]) -> Spheres:
     edges = np.asarray(size)
     edge = min(_TILE_EDGE, float(edges.min()))
     while (counts := np.ceil(edges / edge).astype(int)).prod() > _MAX_TILES:

@@ -195,10 +195,7 @@ def choose_joints(
 
 
 def lock_values(
-    model: RobotModel,
-    semantics: SemanticModel,
-    active: Sequence[str],
-    given: Mapping[str, float],
+    model: RobotModel, semantics: SemanticModel, active: Sequence[str], given: Mapping[str, float]
 ) -> dict[str, float]:
     """The value of every actuated joint that is not in the configuration."""
     rest = [name for name in model.actuated if name not in active]

@@ -11,7 +11,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
+from vprism_plan.robots.geometry import (
+    MeshFile,
+    Points,
+    PrimitiveGeometry,
+    Triangles,
+    Values,
+    Vector,
+)
 
 # Cells along the edge of a cube as large as a link's box, and along its longest edge.
 _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
@@ -37,9 +44,9 @@ class Surface:
         lattice: signed distance at the cells' centres, to within half a cell.
     """
 
-    points: Float[np.ndarray, "v 3"]
+    points: Points
     faces: Int[np.ndarray, "t corners"]
-    lower: Float[np.ndarray, "3"]
+    lower: Vector
     cell: float
     filled: Bool[np.ndarray, "x y z"]
     inner: Bool[np.ndarray, "x y z"]
@@ -47,9 +54,7 @@ class Surface:
     lattice: Float[np.ndarray, "x y z"] = field(repr=False)
 
     @classmethod
-    def of(
-        cls, triangles: Float[np.ndarray, "f 3 3"], tolerance: float, most: int | None = None
-    ) -> Surface:
+    def of(cls, triangles: Triangles, tolerance: float, most: int | None = None) -> Surface:
         """Cut a surface so that spheres which stand out by the tolerance can hold its parts:
         triangles, or boxes around them where there would be more than so many."""
         from scipy import ndimage
@@ -81,7 +86,7 @@ class Surface:
         lattice = np.where(inner, -distance, distance)
         return cls(points, faces, lower, cell, filled, inner, whole, lattice)
 
-    def reach(self, centres: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "c t"]:
+    def reach(self, centres: Points) -> Float[np.ndarray, "c t"]:
         """Distance from each centre to the farthest corner of each triangle."""
         from scipy.spatial.distance import cdist
 
@@ -89,7 +94,7 @@ class Surface:
         corners = (away[:, corner] for corner in self.faces.T)
         return np.asarray(functools.reduce(np.maximum, corners))
 
-    def signed(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    def signed(self, x: Points) -> Values:
         """Signed distance, interpolated between cells; negative inside."""
         from scipy.ndimage import map_coordinates
 
@@ -97,7 +102,7 @@ class Surface:
         return np.asarray(map_coordinates(self.lattice, at.T, order=1, mode="nearest"))
 
 
-def with_hull(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "t 3 3"]:
+def with_hull(triangles: Triangles) -> Triangles:
     """A surface, and its convex hull if it is a shell whose openings a fill runs out of.
 
     Published meshes are often shells with holes, their faces turned either way: nothing says
@@ -120,7 +125,7 @@ def with_hull(triangles: Float[np.ndarray, "f 3 3"]) -> Float[np.ndarray, "t 3 3
     return np.concatenate([triangles, points[hull.simplices]])
 
 
-def _boxes(triangles: Float[np.ndarray, "t 3 3"], edge: float) -> Float[np.ndarray, "b 8 3"]:
+def _boxes(triangles: Triangles, edge: float) -> Float[np.ndarray, "b 8 3"]:
     """Corners of boxes, each around the triangles whose middles are in one cell of a lattice."""
     cells = np.floor(triangles.mean(axis=1) / edge).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
@@ -132,9 +137,7 @@ def _boxes(triangles: Float[np.ndarray, "t 3 3"], edge: float) -> Float[np.ndarr
     return np.where(corners, high[:, None], low[:, None])
 
 
-def _merged(
-    parts: Float[np.ndarray, "t corners 3"],
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t corners"]]:
+def _merged(parts: Float[np.ndarray, "t corners 3"]) -> tuple[Points, Int[np.ndarray, "t corners"]]:
     """Corners, each once, and the parts' indices into them."""
     flat = parts.reshape(-1, 3)
     # As bytes, which sort faster than rows; 0.0 + x turns -0.0 into 0.0.
@@ -143,9 +146,7 @@ def _merged(
     return flat[which], faces.reshape(parts.shape[:2])
 
 
-def split_triangles(
-    triangles: Float[np.ndarray, "f 3 3"], longest: float
-) -> Float[np.ndarray, "t 3 3"]:
+def split_triangles(triangles: Triangles, longest: float) -> Triangles:
     """The same surface in triangles with no edge longer than `longest`, metres."""
     done = []
     while len(triangles):
@@ -156,9 +157,7 @@ def split_triangles(
     return np.concatenate(done)
 
 
-def halved_triangles(
-    triangles: Float[np.ndarray, "f 3 3"], edges: Float[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "t 3 3"]:
+def halved_triangles(triangles: Triangles, edges: Float[np.ndarray, "f 3"]) -> Triangles:
     """Each triangle as two, cut from the middle of its longest edge."""
     rows, start = np.arange(len(triangles)), edges.argmax(axis=1)
     a, b, c = (triangles[rows, (start + k) % 3] for k in range(3))
@@ -168,7 +167,7 @@ def halved_triangles(
 
 def link_triangles(
     solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
-) -> Float[np.ndarray, "f 3 3"]:
+) -> Triangles:
     """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
 
     Raises:
@@ -178,9 +177,7 @@ def link_triangles(
     return np.concatenate([np.empty((0, 3, 3)), *parts])
 
 
-def surface_samples(
-    triangles: Float[np.ndarray, "f 3 3"], count: int = _SAMPLES, seed: int = 0
-) -> Float[np.ndarray, "n 3"]:
+def surface_samples(triangles: Triangles, count: int = _SAMPLES, seed: int = 0) -> Points:
     """Points of a surface: `count` uniform by area, and every corner."""
     if not len(triangles):
         return np.empty((0, 3))
@@ -188,9 +185,7 @@ def surface_samples(
     return np.concatenate([points, triangles.reshape(-1, 3)])
 
 
-def drawn_points(
-    triangles: Float[np.ndarray, "f 3 3"], count: int, seed: int = 0
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def drawn_points(triangles: Triangles, count: int, seed: int = 0) -> tuple[Points, Points]:
     """Points of a surface, uniform by area, and the unit normals of their triangles."""
     rng = np.random.default_rng(seed)
     edges = triangles[:, 1:] - triangles[:, :1]
