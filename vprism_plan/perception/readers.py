@@ -360,7 +360,9 @@ def save_observation(obs: Observation, path: str | Path) -> None:
     if target.suffix == ".npz":
         content = {key: getattr(obs, key) for key in _NPZ_KEYS} | {"plane": plane}
         arrays = {key: np.asarray(value) for key, value in content.items() if value is not None}
-        write_atomically(target, partial(np.savez_compressed, allow_pickle=False, **arrays))
+        write_atomically(
+            target, lambda stream: np.savez_compressed(stream, allow_pickle=False, **arrays)
+        )
     elif target.is_dir() or (target.suffix == "" and not target.is_file()):
         _save_folder(obs, plane, target)
     else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._arguments import number, rigid_pose, whole
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import (
     Pairs,
@@ -30,7 +30,6 @@ from vprism_plan.robots.kinematics import (
     bounding_ball,
     in_frame,
     only_links,
-    rigid_pose,
 )
 from vprism_plan.robots.pairs import NEVER, touching_pairs
 from vprism_plan.robots.sphere_fit import hold_object
@@ -85,35 +84,22 @@ def _with_pairs(arrays: KinematicArrays, added: Sequence[Sequence[int]]) -> Pair
 def _per_link(
     robot: Any, value: float | Mapping[str, float], default: float, what: str
 ) -> Float[np.ndarray, "links"]:
-    """One number per link, from one for all or from a table of links and groups.
-
-    A link's own entry outranks that of a group; of several groups the largest value counts.
-    """
+    """One number per link, from one for all or from a table of links and groups."""
     names = robot.link_names
     if not isinstance(value, Mapping):
         return np.full(len(names), _allowed(value, what, "all links"))
     found: dict[str, float] = {}
     for name in sorted(value, key=lambda key: key in names):
-        number = _allowed(value[name], what, repr(name))
+        given = _allowed(value[name], what, repr(name))
         for link in robot.links_of(name):
             own = name in names or link not in found
-            found[link] = number if own else max(found[link], number)
+            found[link] = given if own else max(found[link], given)
     return np.array([found.get(name, default) for name in names], dtype=np.float64)
 
 
-def _allowed(value: float, what: str, whose: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise RobotError(f"{what} of {whose} is {value!r}; it must be a number") from error
-    if what == "padding" and not (math.isfinite(number) and number >= 0.0):
-        raise RobotError(
-            f"padding of {whose} is {value!r}; it must be finite metres, 0 or more (to shrink "
-            "links, use a scale below 1)"
-        )
-    if what == "scale" and not (math.isfinite(number) and number > 0.0):
-        raise RobotError(f"scale of {whose} is {value!r}; it must be finite and above 0")
-    return number
+def _allowed(value: Any, what: str, whose: str) -> float:
+    above = what == "scale"
+    return number(f"{what} of {whose}", value, 0.0, above=above, error=RobotError)
 
 
 def grown(
@@ -121,9 +107,7 @@ def grown(
 ) -> KinematicArrays:
     """Scale the spheres of each link about the centre of its bounding ball, then pad them.
 
-    What was padding before is scaled like the rest and stays padding, in self-collision up
-    to its old size: the rest of what a scale above 1 makes of it counts as the link's.
-
+    What was padding is scaled like the rest and stays padding, up to its old size.
     A scale above 1 gives each sphere the smallest ball that holds it and its scaled image:
     a link with an elbow does not hold itself when it is only blown up from its middle.
     """
@@ -165,12 +149,7 @@ def _scaled(centers: Points, radii: Values, about: Vector, factor: float) -> tup
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Shape of an attached object in its own frame, metres.
-
-    Attributes:
-        spheres: rows (x, y, z, radius) that hold it.
-        surface: the triangles of its mesh, if one was given.
-    """
+    """Shape of an attached object in its own frame, metres: spheres that hold it, its mesh."""
 
     spheres: Spheres
     surface: Triangles | None = None
@@ -199,7 +178,7 @@ def attached(
         raise RobotError(f"{what}: no link {link!r}; links: {sorted(robot._links)}")
     if isinstance(touch_links, str):
         raise RobotError(f"{what}: touch_links is the string {touch_links!r}; give a sequence")
-    T = np.eye(4) if pose is None else rigid_pose(pose, f"{what}: pose")
+    T = rigid_pose(f"{what}: pose", np.eye(4) if pose is None else pose, error=RobotError)
     carrier = robot._links[link]
     sits = Attachment(carrier.frame, carrier.T @ T)
     siblings = [other for other, parent in robot.attached.items() if parent == link]
@@ -260,8 +239,7 @@ def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
         raise RobotError(f"{what}: give either spheres or a mesh")
     if mesh is None:
         return Held(_sphere_rows(spheres, what))
-    if max_spheres < 1:
-        raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
+    whole(f"{what}: max_spheres", max_spheres, 1, error=RobotError)
     triangles = read_triangles(mesh, what)
     return Held(hold_object(triangles, max_spheres), triangles)
 
@@ -296,16 +274,13 @@ def _with_link(
 
 
 def _sphere_rows(spheres: object, what: str) -> Spheres:
+    wanted = "give at least one row (x, y, z, radius) in metres"
     try:
         rows = np.array(spheres, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise RobotError(
-            f"{what}: spheres are not rows (x, y, z, radius) in metres: {error}"
-        ) from error
+        raise RobotError(f"{what}: spheres are no array of numbers: {error}; {wanted}") from error
     if rows.ndim != 2 or rows.shape[1] != 4 or len(rows) == 0:
-        raise RobotError(
-            f"{what}: spheres have shape {rows.shape}; give at least one row (x, y, z, radius)"
-        )
+        raise RobotError(f"{what}: spheres have shape {rows.shape}; {wanted}")
     bad = np.flatnonzero(~(np.isfinite(rows).all(axis=1) & (rows[:, 3] > 0.0)))
     if len(bad):
         raise RobotError(

@@ -45,23 +45,14 @@ PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | Non
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """A mesh that a URDF names as collision geometry; read when it is needed.
+    """A mesh that a URDF names as collision geometry; read when it is needed."""
 
-    Attributes:
-        link: Whose geometry it is.
-        filename: As the URDF writes it.
-        scale: (3,) factors along the mesh's own axes.
-        T_link: (4, 4) pose in the link's frame.
-        path: The file, or None if there is none.
-        searched: Where it was looked for.
-    """
-
-    link: str
-    filename: str
-    scale: Vector
-    T_link: Pose
-    path: Path | None
-    searched: tuple[str, ...] = ()
+    link: str  # whose geometry it is
+    filename: str  # as the URDF writes it
+    scale: Vector  # factors along the mesh's own axes
+    T_link: Pose  # in the link's frame
+    path: Path | None  # the file, or None if there is none
+    searched: tuple[str, ...] = ()  # where it was looked for
 
     def require(self) -> Path:
         """Return the file.
@@ -146,9 +137,9 @@ def find_mesh(
 
     ``package://NAME/REST`` is looked for as ``package_dirs`` says, in ROS_PACKAGE_PATH and in
     AMENT_PREFIX_PATH (``share/NAME``), beside each folder above the URDF, and last as
-    ``REST`` below each of these folders (a checkout need not have the package's name): that
-    may be another package's file, so it is logged, and not done for a package that
-    ``package_dirs`` has. Other names are relative to the URDF's folder.
+    ``REST`` below each of these folders (a checkout need not have the package's name), which
+    is logged, and not done for a package that ``package_dirs`` has. Other names are relative
+    to the URDF's folder.
 
     Returns:
         The file or None, and the places where it was looked for.
@@ -220,14 +211,7 @@ class PrimitiveGeometry:
     padding: float = 0.0
 
     def signed_distance(self, points: Points) -> Values:
-        """Exact signed distance of points to the solid.
-
-        Args:
-            points: (n, 3) positions in the link's frame, metres.
-
-        Returns:
-            (n,) metres, negative inside.
-        """
+        """Exact signed distance (metres, negative inside) of points in the link's frame."""
         local = (points - self.T_link[:3, 3]) @ self.T_link[:3, :3]
         if self.kind == "sphere":
             return np.linalg.norm(local, axis=1) - self.size[0] - self.padding

@@ -10,15 +10,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from vprism_plan._arguments import rigid_pose
 from vprism_plan._read_only import make_read_only
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import changes, pairs, solid_balls
+from vprism_plan.robots import changes, pairs, surfaces
 from vprism_plan.robots.changes import Held
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, Pairs, Pose, PrimitiveGeometry
 from vprism_plan.robots.kinematics import (
@@ -29,18 +30,12 @@ from vprism_plan.robots.kinematics import (
     frame_poses,
     joint_values,
     reach_bound,
-    rigid_pose,
 )
 from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
-from vprism_plan.robots.solid_balls import SolidBalls
-from vprism_plan.robots.sphere_files import write_spheres
+from vprism_plan.robots.sphere_files import link_spheres, write_spheres
 from vprism_plan.robots.sphere_fit import SphereFit
-from vprism_plan.robots.spheres import link_spheres
 from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, lock_values, write_srdf
 from vprism_plan.robots.urdf import load_model
-
-if TYPE_CHECKING:
-    pass
 
 READY = "ready"
 _logger = logging.getLogger(__name__)
@@ -50,9 +45,8 @@ _logger = logging.getLogger(__name__)
 class Robot:
     """A robot read from a URDF; build it with :meth:`from_urdf`.
 
-    A configuration ``q`` has one value per name in ``joint_names``: radians for
-    revolute and continuous joints, metres for prismatic ones. Its arrays are read-only; copy
-    what is to be changed.
+    A configuration ``q`` has one value per name in ``joint_names``: radians for revolute and
+    continuous joints, metres for prismatic ones. Arrays are read-only.
 
     Attributes:
         name: The robot's name.
@@ -68,7 +62,7 @@ class Robot:
         disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's; with
             an SRDF or without, "Adjacent" for links joined by a joint (also through links
             without spheres) and "Rigid" for links that no joint moves against each other;
-            "Always" and "Never" of random configurations; or what :meth:`attach` was told.
+            "Always" and "Never" of random configurations; or what :meth:`attach` says.
         arrays: The flat form that compiled kernels read.
         meshes: Link name -> its collision meshes, read when they are asked for; scaled as
             the robot is, without its padding, by which nothing grows a mesh.
@@ -76,9 +70,8 @@ class Robot:
             spheres as they were read or fitted, without padding, scale and attached objects.
         sphere_sources: Link name -> where its spheres are from: "file", "urdf", "tiled"
             over boxes and cylinders, or "fitted".
-        geometry_as_read: ``geometry`` without padding and scale: what belongs to
-            ``link_spheres``.
-        meshes_as_read: ``meshes`` of all links, scaled and padded ones too.
+        geometry_as_read, meshes_as_read: ``geometry`` and ``meshes`` without padding and
+            scale: what belongs to ``link_spheres``.
         attached: Name of each attached object -> the link that carries it.
         held: Name of each attached object -> its shape.
     """
@@ -136,22 +129,20 @@ class Robot:
 
         Args:
             path: The URDF (xacro expanded).
-            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is one.
-                Without an SRDF, ``disabled_pairs`` is generated: links joined by a joint or
-                rigid to each other, links whose spheres always overlap, and links that
-                stay far apart, both judged by ``matrix_samples`` random configurations.
+            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is one. Without
+                an SRDF, ``disabled_pairs`` is generated: links joined by a joint or rigid to
+                each other, links whose spheres always overlap, and links that stay far apart,
+                both judged by ``matrix_samples`` random configurations.
             spheres: Collision spheres: a YAML file (``collision_spheres: {link:
                 [{center: [x, y, z], radius: r}]}``), a robot file of cuRobo, an XRDF file,
                 such content as a mapping, or None: ``<stem>_spheres.yml`` beside the URDF,
                 else spheres that enclose the URDF's own geometry (spheres are taken as
                 they are). "fit" does so in any case.
             base_pose: (4, 4) pose of the root link in the world; None is identity.
-            joints: Joints of a configuration, in the order wanted. None takes the
-                SRDF group "arm" if there is one, else all joints that move and do
-                not mimic another.
-            locked: Values for joints not in ``joints``. Default for each: its value
-                in the SRDF (state "ready" first, then file order), else 0 or the
-                limit next to it.
+            joints: Joints of a configuration, in the order wanted. None takes the SRDF group
+                "arm" if there is one, else all joints that move and do not mimic another.
+            locked: Values for joints not in ``joints``. Default for each: its value in the
+                SRDF (state "ready" first, then file order), else 0 or the limit next to it.
             group: Instead of ``joints``: an SRDF group, whose joints are taken.
             package_dirs: Where ``package://NAME/...`` leads to: folders that hold packages,
                 or a mapping from a name to its folder. ROS_PACKAGE_PATH, AMENT_PREFIX_PATH
@@ -160,8 +151,7 @@ class Robot:
             matrix_samples: For the pairs that are generated.
 
         Raises:
-            RobotError: Something above is malformed or does not fit together; the
-                message names it.
+            RobotError: Something above is malformed or does not fit together.
         """
         path = Path(path)
         model = load_model(path, package_dirs)
@@ -171,7 +161,9 @@ class Robot:
         semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
         active = choose_joints(model, semantics, joints, group)
         fixed_values = lock_values(model, semantics, active, locked or {})
-        base = rigid_pose(np.eye(4) if base_pose is None else base_pose)
+        base = rigid_pose(
+            "base_pose", np.eye(4) if base_pose is None else base_pose, error=RobotError
+        )
         chosen = link_spheres(model, path, spheres, fit or SphereFit())
         arrays, links = build_arrays(model, active, fixed_values, chosen.rows, base)
         stated = None if srdf is None else semantics.disabled
@@ -265,9 +257,7 @@ class Robot:
     def links_of(self, name: str) -> tuple[str, ...]:
         """The links with collision spheres that a name stands for.
 
-        Args:
-            name: A link of ``link_names`` or an SRDF group. Where both have the name, it
-                is the link.
+        A link outranks an SRDF group of the same name.
 
         Raises:
             RobotError: There is no such link or group, or it has no collision spheres.
@@ -297,8 +287,7 @@ class Robot:
             q to any order. Batched already: torch.vmap over it is not supported.
 
         Raises:
-            RobotError: q is not numbers, has another dtype, a wrong last dimension, or values
-                that are not finite.
+            RobotError: q is not finite numbers, or has another dtype or last dimension.
         """
         import torch
 
@@ -315,16 +304,10 @@ class Robot:
         return world.reshape(*q.shape[:-1], *world.shape[1:])
 
     def link_poses(self, q: Any) -> dict[str, np.ndarray]:
-        """World poses of all links of the URDF.
-
-        Args:
-            q: (dof,) configuration.
+        """World poses (4, 4) of all links of the URDF, by name, for one configuration.
 
         Raises:
             RobotError: See :meth:`check_configuration`.
-
-        Returns:
-            Link name -> (4, 4).
         """
         R, t = frame_poses(self.arrays, self.check_configuration(q)[None])
         poses = {}
@@ -334,20 +317,16 @@ class Robot:
             poses[link] = frame @ sits.T
         return poses
 
-    def solid_balls(self, q: Any) -> SolidBalls:
+    def solid_balls(self, q: Any) -> surfaces.SolidBalls:
         """What the robot itself fills: balls inside its solids, where collision spheres hold them.
 
-        From the collision geometry of the URDF and the meshes of attached objects as they
-        are: padding and scale do not count. Meshes are read; a second or two for an arm, kept
-        for other configurations.
-
-        Args:
-            q: (dof,) configuration.
+        From the collision geometry of the URDF and the meshes of attached objects as they are,
+        without padding and scale. Takes a second or two for an arm, the first time.
 
         Raises:
             RobotError: See :meth:`check_configuration`.
         """
-        return solid_balls.solid_balls(self, q)
+        return surfaces.solid_balls(self, q)
 
     def random_configuration(self, rng: np.random.Generator) -> Float[np.ndarray, "dof"]:
         """A uniform configuration within the limits."""
@@ -380,20 +359,14 @@ class Robot:
         return robot_warnings(self)
 
     def with_base_pose(self, base_pose: ArrayLike) -> Robot:
-        """The same robot standing elsewhere; shares everything but the base.
-
-        Args:
-            base_pose: (4, 4) pose of the root link in the world.
+        """The same robot with its root link at another (4, 4) pose in the world.
 
         Raises:
             RobotError: The pose is not a rigid motion.
         """
-        base = rigid_pose(base_pose)
-        arrays = dataclasses.replace(
-            self.arrays,
-            base_R=np.ascontiguousarray(base[:3, :3]),
-            base_t=np.ascontiguousarray(base[:3, 3]),
-        )
+        base = rigid_pose("base_pose", base_pose, error=RobotError)
+        R, t = base[:3, :3].copy(), base[:3, 3].copy()
+        arrays = dataclasses.replace(self.arrays, base_R=R, base_t=t)
         return dataclasses.replace(self, base_pose=base, arrays=arrays)
 
     def with_padding(
@@ -470,9 +443,7 @@ class Robot:
     def report(self) -> RobotReport:
         """Compare the spheres with the geometry of the URDF, and list what is not tested.
 
-        For every link: whether its spheres hold it (proved), how much of it, and how far
-        they stand out. Takes a second or so for an arm. Padding, scale and attached
-        objects do not enter.
+        Takes a second or so for an arm. Padding, scale and attached objects do not enter.
 
         Raises:
             RobotError: A mesh file cannot be read; missing ones are reported as such.
@@ -484,10 +455,6 @@ class Robot:
 
         Where spheres are coarse, or a locked joint stands badly, a pair can refuse most of
         them.
-
-        Args:
-            samples: Uniform configurations within the limits.
-            seed: Of these.
 
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files of collision spheres: this package's YAML, cuRobo's, and XRDF."""
+"""Collision spheres of links: of a file (this package's YAML, cuRobo's, XRDF), else fitted."""
 
 from __future__ import annotations
 
 import functools
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +16,9 @@ import numpy as np
 from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import Spheres
+from vprism_plan.robots.sphere_fit import SphereFit, enclosing_spheres, fit_spheres
+from vprism_plan.robots.surfaces import link_triangles
+from vprism_plan.robots.urdf import RobotModel
 
 LinkSpheres = dict[str, np.ndarray]
 """Link name -> (n, 4) rows (x, y, z, radius) in the link's frame, metres."""
@@ -26,22 +30,121 @@ _LONGEST_VALUE = 1000  # characters; a number is read in the square of that
 _EXPECTED = "'collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}'"
 
 
+FIT = "fit"
+# So many tiles are taken as they are; what needs more is fitted, which needs fewer.
+_FEW_TILES = 12
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ChosenSpheres:
+    """The spheres of a robot's links, and where they are from."""
+
+    rows: LinkSpheres  # never empty
+    sources: dict[str, str]  # "file", "urdf" (of its own), "tiled" (over its solids) or "fitted"
+    padding: dict[str, float] = field(default_factory=dict)  # metres that a file adds to them
+
+
+def link_spheres(
+    model: RobotModel,
+    urdf_path: Path,
+    spheres: str | Path | Mapping[str, Any] | None,
+    fit: SphereFit,
+) -> ChosenSpheres:
+    """Choose and validate the collision spheres of a robot.
+
+    The arguments are those of :meth:`Robot.from_urdf`.
+
+    Raises:
+        RobotError: A sphere is malformed, of an unknown link, or missing where geometry is.
+    """
+    named = set(fit.max_spheres) if isinstance(fit.max_spheres, Mapping) else set()
+    if named - model.links.keys():
+        raise RobotError(
+            f"max_spheres names the links {sorted(named - model.links.keys())}, which the robot "
+            f"does not have; links: {list(model.links)}"
+        )
+    if spheres is None:
+        beside = urdf_path.with_name(f"{urdf_path.stem}_spheres.yml")
+        spheres = beside if beside.is_file() else FIT
+    if isinstance(spheres, str) and spheres == FIT:
+        chosen = _from_geometry(model, tuple(model.links), fit)
+        if not chosen.rows:
+            raise RobotError(
+                f"'{urdf_path}': no link has collision geometry; add <collision> elements, or pass "
+                "spheres={link: [{center, radius}]}"
+            )
+        return chosen
+    table = read_spheres(spheres)
+    known = {name: rows for name, rows in table.spheres.items() if name in model.links}
+    for link, rows in table.spheres.items():
+        if link not in model.links and (len(rows) or not table.foreign):
+            raise RobotError(
+                f"{table.source} gives spheres for the unknown link '{link}'; "
+                f"links: {list(model.links)}"
+            )
+    bare = tuple(name for name in model.links if name not in known and _has_geometry(model, name))
+    if bare and not table.foreign:
+        raise RobotError(
+            f"{table.source} gives no spheres for the links {list(bare)}, which have collision "
+            "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
+            "on purpose"
+        )
+    emptied = [name for name, rows in known.items() if not len(rows) and _has_geometry(model, name)]
+    if emptied and table.foreign:
+        _logger.warning(
+            "%s leaves the links %s without spheres; they have collision geometry and are not "
+            "checked",
+            *(table.source, emptied),
+        )
+    rest = _from_geometry(model, bare, fit)
+    if rest.rows:
+        _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
+    everything, sources = known | rest.rows, dict.fromkeys(known, "file") | rest.sources
+    held = {name: everything[name] for name in model.links if len(everything.get(name, ()))}
+    if not held:
+        raise RobotError(f"{table.source} gives no link a sphere; a robot needs at least one")
+    return ChosenSpheres(held, {name: sources[name] for name in held}, table.padding)
+
+
+def _has_geometry(model: RobotModel, name: str) -> bool:
+    return bool(model.links[name].primitives or model.links[name].meshes)
+
+
+def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) -> ChosenSpheres:
+    """Spheres that hold the collision geometry of the URDF."""
+    rows: LinkSpheres = {}
+    sources: dict[str, str] = {}
+    for name in links:
+        link = model.links[name]
+        own = [solid for solid in link.primitives if solid.kind == "sphere"]
+        rest = [solid for solid in link.primitives if solid.kind != "sphere"]
+        parts = [enclosing_spheres(solid) for solid in own]
+        tiles = [enclosing_spheres(solid) for solid in rest]
+        if link.meshes or sum(map(len, tiles)) > _FEW_TILES:
+            surface = link_triangles(rest, link.meshes)
+            tolerance, most = fit.allowed(surface), fit.most(name, surface)
+            parts.append(fit_spheres(surface, tolerance, most))
+            sources[name] = "fitted"
+        elif tiles:
+            parts += tiles
+            sources[name] = "tiled"
+        elif own:
+            sources[name] = "urdf"
+        if parts:
+            rows[name] = np.vstack(parts)
+    return ChosenSpheres(rows, sources)
+
+
+# -------------------------------------------------------------------------------------- files
 @dataclass(frozen=True)
 class SphereTable:
-    """What a file or a mapping says of spheres.
+    """What a file or a mapping says of spheres; links that a foreign one leaves out are fitted."""
 
-    Attributes:
-        source: For messages.
-        spheres: Spheres by link, those that are switched off left out; a link may have none.
-        padding: Metres by which links' spheres are to grow against the world.
-        foreign: Whether another program's file: links that it leaves out are then fitted,
-            and links it adds are passed over if they have no spheres.
-    """
-
-    source: str
-    spheres: LinkSpheres
-    padding: dict[str, float] = field(default_factory=dict)
-    foreign: bool = False
+    source: str  # for messages
+    spheres: LinkSpheres  # those that are switched off left out; a link may have none
+    padding: dict[str, float] = field(default_factory=dict)  # metres against the world
+    foreign: bool = False  # another program's, which may name links that the robot lacks
 
 
 def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:

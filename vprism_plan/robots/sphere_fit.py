@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Few spheres that hold a link: its surface triangle by triangle, and what is inside it.
+"""Spheres that hold a link: fitted to its surface and what is inside it, or tiles of a solid.
 
 A sphere of radius ``r`` whose centre lies ``a`` deep in a solid stands out of it by ``r - a``
 at most; one whose centre lies ``b`` outside, by ``r + b``. With the signed distance ``s`` to
@@ -17,15 +17,24 @@ so with all of itself). Three steps, all without chance:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vprism_plan._arguments import number, whole
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import Indices, Points, Spheres, Triangles, Values, Vector
+from vprism_plan.robots.geometry import (
+    Indices,
+    Points,
+    PrimitiveGeometry,
+    Spheres,
+    Triangles,
+    Values,
+    Vector,
+)
 from vprism_plan.robots.surfaces import Surface, with_hull
 
 _MOST, _ARM_SIZED = 12, 0.35
@@ -37,9 +46,7 @@ _MANY = 25_000
 _ROUNDS = 30
 # Relative and absolute (metres): what rounding may take away from a radius.
 _SLACK, _HAIR = 1e-9, 1e-9
-_STEPS = np.array(
-    [[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.float64
-)
+_STEPS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 _STEPS /= np.maximum(np.linalg.norm(_STEPS, axis=1, keepdims=True), 1.0)
 
 
@@ -68,13 +75,11 @@ class SphereFit:
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "relative"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise RobotError(f"{name} is {value!r}; it must be finite and above 0")
+            number(name, getattr(self, name), 0.0, above=True, error=RobotError)
         table = self.max_spheres
         for most in table.values() if isinstance(table, Mapping) else [table]:
-            if most is not None and most < 1:
-                raise RobotError(f"max_spheres is {most}; every link needs at least 1")
+            if most is not None:
+                whole("max_spheres", most, 1, error=RobotError)
 
     def most(self, link: str, triangles: Triangles) -> int:
         """Return the largest number of spheres for a link with this surface."""
@@ -102,8 +107,7 @@ def fit_spheres(triangles: Triangles, tolerance: float, max_spheres: int) -> Sph
     Args:
         triangles: (f, 3, 3) corners, metres; closed or not, in one piece or many.
         tolerance: Metres by which spheres may stand out if `max_spheres` suffice for it.
-        max_spheres: At most so many (a hollow that they leave is filled beyond that, by
-            spheres that do not stand out).
+        max_spheres: At most so many, but for a hollow that they leave.
 
     Returns:
         (n, 4) rows (x, y, z, radius), metres; the same for equal arguments.
@@ -178,11 +182,7 @@ def _candidate_cells(depth: Values, most: int) -> Indices:
 
 
 def _greedy_cover(reach: np.ndarray, radius: Values, most: int) -> list[int] | None:
-    """Choose spheres until all is held: each time the one that holds most of what is new.
-
-    Returns:
-        Indices, or None if more than `most` would be needed.
-    """
+    """Choose spheres until all is held, always the one that holds most of what is new."""
     holds = reach <= radius[:, None]
     if not holds.any(axis=0).all():
         return None
@@ -295,3 +295,82 @@ def _cells_held(
         parts = (middles[~held][:, None] + 0.5 * edge * offsets).reshape(-1, 3)
         held[~held] = _cells_held(parts, 0.5 * edge, spheres, deep - 1).reshape(-1, 8).all(axis=1)
     return np.asarray(held)
+
+
+# -------------------------------------------------------------------------------------- tiles
+# Pieces of about this size (metres) protrude by about half of it.
+_TILE_EDGE, _MAX_TILES = 0.06, 64
+
+
+def enclosing_spheres(solid: PrimitiveGeometry) -> Spheres:
+    """Spheres whose union holds a solid.
+
+    A box is cut into box cells, a cylinder into slices of rings of sectors; each piece gets a
+    ball through its corners, which are what is farthest from the ball's centre.
+
+    Returns:
+        (n, 4) rows (x, y, z, radius) in the link's frame, metres.
+    """
+    if solid.kind == "sphere":
+        return np.array([[*solid.T_link[:3, 3], solid.size[0] + solid.padding]])
+    local = _tile_cylinder(*solid.size) if solid.kind == "cylinder" else _tile_box(solid.size)
+    local[:, :3] = local[:, :3] @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
+    # Rounding must not open a gap at the corners, nor must a proof of enclosure, which sees a
+    # prism of many sides for a cylinder, find one.
+    local[:, 3] = local[:, 3] * (1.0 + 1e-3) + solid.padding
+    return local
+
+
+def _tile_cylinder(radius: float, length: float) -> Spheres:
+    """A ball on the axis and rings of balls around it, repeated along the axis."""
+    edge = _TILE_EDGE
+    while True:
+        rings = math.ceil(radius / edge)
+        # A slender cylinder gains nothing from slices much thinner than it is wide.
+        slices = math.ceil(length / max(0.5 * edge, min(edge, radius)))
+        count = 1 + int(_sectors(radius, rings, edge).sum())
+        if count * slices <= _MAX_TILES or count == slices == 1:
+            break
+        edge *= 1.1
+    disc = _tile_disc(radius, rings, edge)
+    step = length / slices
+    heights = (np.arange(slices) + 0.5) * step - 0.5 * length
+    rows = np.empty((slices, len(disc), 4))
+    rows[..., :2] = disc[:, :2]
+    rows[..., 2] = heights[:, None]
+    rows[..., 3] = np.hypot(disc[:, 2], 0.5 * step)
+    return rows.reshape(-1, 4)
+
+
+def _sectors(radius: float, rings: int, edge: float) -> Indices:
+    """Into how many sectors each ring of a disc but the innermost is cut."""
+    outer = np.arange(2, rings + 1) * (radius / rings)
+    return np.maximum(4, np.ceil(2 * math.pi * outer / edge)).astype(np.int64)
+
+
+def _tile_disc(radius: float, rings: int, edge: float) -> Points:
+    """Circles (x, y, radius) whose union holds a disc."""
+    width = radius / rings
+    circles = [np.array([[0.0, 0.0, width]])]
+    for ring, n in enumerate(_sectors(radius, rings, edge).tolist(), start=1):
+        inner, outer = ring * width, (ring + 1) * width
+        half = math.pi / n
+        # Equally far from the sector's inner and outer corners.
+        middle = (inner + outer) / (2 * math.cos(half))
+        reach = math.hypot(outer * math.cos(half) - middle, outer * math.sin(half))
+        turn = 2 * math.pi * np.arange(n) / n
+        circles.append(
+            np.column_stack([middle * np.cos(turn), middle * np.sin(turn), np.full(n, reach)])
+        )
+    return np.vstack(circles)
+
+
+def _tile_box(size: Sequence[float]) -> Spheres:
+    edges = np.asarray(size)
+    edge = min(_TILE_EDGE, float(edges.min()))
+    while (counts := np.ceil(edges / edge).astype(int)).prod() > _MAX_TILES:
+        edge *= 1.1
+    cell = edges / counts
+    axes = [(np.arange(n) + 0.5) * c - 0.5 * e for n, c, e in zip(counts, cell, edges, strict=True)]
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.column_stack([centers, np.full(len(centers), 0.5 * np.linalg.norm(cell))])

@@ -24,19 +24,13 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SemanticModel:
-    """What an SRDF adds to a URDF.
+    """What an SRDF adds to a URDF, in file order."""
 
-    Attributes:
-        groups: Group name -> names of the joints in it, in file order.
-        group_links: Group name -> names of the links in it, in file order.
-        states: (state name, group) -> joint name -> value, in file order.
-        disabled: Unordered link pair -> the reason the file gives.
-    """
-
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)  # names of joints
     group_links: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    # (state, group) -> joint -> value
     states: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
-    disabled: dict[frozenset[str], str] = field(default_factory=dict)
+    disabled: dict[frozenset[str], str] = field(default_factory=dict)  # pair -> reason
 
     def state_value(self, joint: str) -> float | None:
         """The joint's value in the first state that names it ("ready" before others)."""
@@ -59,9 +53,8 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     """Read an SRDF and check every name in it against the URDF.
 
     Raises:
-        RobotError: The file is missing or malformed, or names links or joints the
-            robot does not have: a disabled pair with a typing error would
-            otherwise disable nothing, or the wrong thing.
+        RobotError: The file is missing or malformed, or names links or joints the robot does
+            not have: a disabled pair with a typing error would disable nothing.
     """
     path = Path(path)
     if not path.is_file():
@@ -76,11 +69,7 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
 def _groups(
     root: ET.Element, model: RobotModel, path: Path
 ) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
-    """The joints and the links of every group.
-
-    As in MoveIt, the links of a group are those that its joints move directly: the base
-    of a chain is not one of them, nor is what hangs below a joint's child.
-    """
+    """The joints and the links of every group: as in MoveIt, what its joints move directly."""
     groups: dict[str, tuple[str, ...]] = {}
     links: dict[str, tuple[str, ...]] = {}
     parent_of = {joint.child: joint for joint in model.joints}

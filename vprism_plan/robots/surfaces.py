@@ -1,20 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A link's surface: its triangles, small ones and points of them, and what is inside."""
+"""A link's surface: its triangles, small ones and points of them, and what is inside: balls."""
 
 from __future__ import annotations
 
 import functools
+import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import (
     MeshFile,
     Points,
+    Pose,
     PrimitiveGeometry,
+    Spheres,
     Triangles,
     Values,
     Vector,
@@ -31,26 +36,16 @@ _SAMPLES = 4000
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Small triangles, and a lattice of signed distances to them.
+    """Small triangles, and a lattice of signed distances to them."""
 
-    Attributes:
-        points: (v, 3) corners, each once.
-        faces: (t, 3) indices into them; (t, 8) for boxes around triangles.
-        lower: outer corner of the lattice's first cell.
-        cell: edge of a cell.
-        filled: cells with surface in them or enclosed by such cells.
-        inner: those without a corner.
-        whole: those that no surface reaches: they lie inside.
-        lattice: signed distance at the cells' centres, to within half a cell.
-    """
-
-    points: Points
-    faces: Int[np.ndarray, "t corners"]
-    lower: Vector
-    cell: float
-    filled: Bool[np.ndarray, "x y z"]
-    inner: Bool[np.ndarray, "x y z"]
-    whole: Bool[np.ndarray, "x y z"]
+    points: Points  # corners, each once
+    faces: Int[np.ndarray, "t corners"]  # indices into them: 3, or 8 for boxes around triangles
+    lower: Vector  # outer corner of the lattice's first cell
+    cell: float  # edge of a cell
+    filled: Bool[np.ndarray, "x y z"]  # cells with surface in them or enclosed by such cells
+    inner: Bool[np.ndarray, "x y z"]  # those without a corner
+    whole: Bool[np.ndarray, "x y z"]  # those that no surface reaches: they lie inside
+    # Signed distance at the cells' centres, to within half a cell.
     lattice: Float[np.ndarray, "x y z"] = field(repr=False)
 
     @classmethod
@@ -196,3 +191,153 @@ def drawn_points(triangles: Triangles, count: int, seed: int = 0) -> tuple[Point
     share = np.where(share.sum(axis=1, keepdims=True) > 1.0, 1.0 - share, share)
     points = triangles[which, 0] + np.einsum("nk,nkj->nj", share, edges[which])
     return points, normal[which] / area[which, None]
+
+
+# ------------------------------------------------------------------------ balls inside solids
+# Metres between centres, and by how much balls may fall short of such a point. Together: some
+# thousand balls for an arm, which fall short of its edges by 7 mm at most.
+_APART, _SHORT = 0.01, 0.002
+# Deep inside, where the largest balls are in any case, one point in so many is looked after.
+_INNER_SHARE = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SolidBalls:
+    """What a robot fills in one configuration, world frame, metres.
+
+    Collision spheres hold a link and stand out of it; balls inside its solids are held by it.
+    What they hold is the robot, and nothing else can be there.
+    """
+
+    inner: Spheres  # balls inside the solids that fill them; points of their surface: radius 0
+    spheres: Spheres  # collision spheres of links without solids, which may stand out of them
+    without: tuple[str, ...]  # names of these links
+
+
+def solid_balls(robot: Any, q: Any) -> SolidBalls:
+    """See :meth:`Robot.solid_balls`."""
+    inner, spheres, without = [np.empty((0, 4))], [np.empty((0, 4))], []
+    for name, pose in robot.link_poses(q).items():
+        solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
+        bare, held = robot.link_spheres.get(name), robot.held.get(name)
+        if held is not None:
+            bare, meshes = held.spheres, () if held.surface is None else (held,)
+        complete = bool(solids or meshes)
+        try:
+            rows = inner_balls(solids, meshes)
+        except RobotError:  # the file of a mesh is missing or broken
+            rows, complete = inner_balls(solids, ()), False
+        inner.append(_placed(rows, pose))
+        if bare is not None and not complete:
+            spheres.append(_placed(bare, pose))
+            without.append(name)
+    return SolidBalls(np.concatenate(inner), np.concatenate(spheres), tuple(without))
+
+
+def _placed(rows: Spheres, pose: Pose) -> np.ndarray:
+    return np.column_stack([rows[:, :3] @ pose[:3, :3].T + pose[:3, 3], rows[:, 3]])
+
+
+@functools.lru_cache(maxsize=256)
+def inner_balls(solids: tuple[PrimitiveGeometry, ...], meshes: tuple[Any, ...]) -> Spheres:
+    """Balls inside a link's solids that together fill their union.
+
+    Inside a mesh is what its surface encloses, cracks narrower than a cell (a fortieth to an
+    eighteenth of its length) being closed. Of a shell with larger holes only the surface is
+    known: balls of radius 0.
+
+    Args:
+        solids: primitives without padding.
+        meshes: `MeshFile`s, or what else has their `triangles`.
+
+    Returns:
+        (n, 4) rows (x, y, z, radius), link frame, metres. Read-only.
+    """
+    exact, parts = [np.empty((0, 4))], [np.empty((0, 4))]
+    for solid in solids:
+        if solid.kind == "sphere":
+            exact.append(np.array([[*solid.T_link[:3, 3], solid.size[0]]]))
+            continue
+        rows = _of_primitive(solid)
+        # What lies deeper in another solid is that one's to fill.
+        for other in solids:
+            if other is not solid:
+                rows = rows[-other.signed_distance(rows[:, :3]) <= rows[:, 3] + 1e-9]
+        parts.append(rows)
+    parts += [_of_mesh(mesh.triangles()) for mesh in meshes]
+    found = np.concatenate([*exact, _cover(np.concatenate(parts))])
+    found.setflags(write=False)
+    return found
+
+
+def _of_primitive(solid: PrimitiveGeometry) -> Spheres:
+    """A lattice along the solid's own axes: faces, edges and corners are on it."""
+    places = _lattice(solid.kind, solid.size) @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
+    return np.column_stack([places, np.maximum(-solid.signed_distance(places), 0.0)])
+
+
+def _lattice(kind: str, size: Sequence[float]) -> Points:
+    if kind == "box":
+        axes = [_steps(-0.5 * edge, 0.5 * edge) for edge in size]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    radius, length = size
+    disc = [np.zeros((1, 2))]
+    for ring in _steps(0.0, radius)[1:]:
+        count = max(math.ceil(2.0 * math.pi * ring / _APART), 6)
+        angles = 2.0 * math.pi * np.arange(count) / count
+        disc.append(ring * np.column_stack([np.cos(angles), np.sin(angles)]))
+    flat, heights = np.concatenate(disc), _steps(-0.5 * length, 0.5 * length)
+    return np.concatenate([np.insert(flat, 2, height, axis=1) for height in heights])
+
+
+def _steps(first: float, last: float) -> Values:
+    return np.linspace(first, last, max(math.ceil((last - first) / _APART), 1) + 1)
+
+
+def _of_mesh(triangles: Triangles) -> Spheres:
+    """Points of the surface, and the middles of cells that it encloses.
+
+    In triangles without an edge longer than `_APART` every point is at most that over sqrt(3)
+    from a corner. That way is square to the one from the middle to the nearest point (along
+    an edge or face of its triangle), so the latter is at least the cathetus.
+    """
+    from scipy.spatial import cKDTree
+
+    surface = Surface.of(triangles, math.inf)
+    corners = split_triangles(triangles, _APART).reshape(-1, 3)
+    middles = surface.lower + surface.cell * (np.argwhere(surface.whole) + 0.5)
+    away, _ = cKDTree(corners).query(middles)
+    radius = np.sqrt(np.maximum(away**2 - _APART**2 / 3.0, 0.0))
+    _, first = np.unique(np.round(corners / _SHORT), axis=0, return_index=True)
+    rim = np.insert(corners[first], 3, 0.0, axis=1)
+    return np.concatenate([rim, np.column_stack([middles, radius])])
+
+
+def _cover(rows: Spheres) -> Spheres:
+    """The balls that, up to `_SHORT`, hold all middles near the surface and a share of others.
+
+    Chosen greedily: each time the ball that holds most of what is not held yet.
+    """
+    from scipy.spatial import cKDTree
+
+    near = rows[:, 3] < _APART
+    aimed = np.concatenate([rows[near, :3], rows[~near, :3][::_INNER_SHARE]])
+    if not len(aimed):
+        return rows
+    balls = cKDTree(aimed).query_ball_point(rows[:, :3], rows[:, 3] + _SHORT)
+    held = [np.array(points, dtype=np.int64) for points in balls]
+    left, missing = np.ones(len(aimed), dtype=bool), len(aimed)
+    # What a ball would add only falls, so the best by old counts is counted again.
+    waiting = [(-len(points), index) for index, points in enumerate(held)]
+    heapq.heapify(waiting)
+    chosen = []
+    while missing:
+        _, index = heapq.heappop(waiting)
+        gain = int(left[held[index]].sum())
+        if waiting and gain < -waiting[0][0]:
+            heapq.heappush(waiting, (-gain, index))
+            continue
+        chosen.append(index)
+        left[held[index]] = False
+        missing -= gain
+    return rows[chosen]

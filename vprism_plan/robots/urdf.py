@@ -258,11 +258,7 @@ def _axis(joint: ET.Element, name: str, kind: str, path: Path) -> np.ndarray:
 
 
 def _limits(joint: ET.Element, name: str, kind: str, path: Path) -> tuple[float, float, float]:
-    """Lower, upper and velocity limit; a velocity of 0 or none stated becomes inf.
-
-    Soft limits of a <safety_controller> narrow the range, as MoveIt has it: beyond them a
-    controller pushes back. Continuous joints have none.
-    """
+    """Lower, upper and velocity limit (none or 0: inf); soft limits narrow it, as in MoveIt."""
     limit, soft = joint.find("limit"), joint.find("safety_controller")
     velocity = _number(limit, "velocity") or math.inf
     if not velocity >= 0.0:
