@@ -24,14 +24,10 @@ from vprism_plan.perception.plane import Plane
 
 # Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.
 DEFAULT_MAX_RANGE = 10.0
-# No table-top sensor measures this far: a median above it means millimetres.
-MAX_MEDIAN_DEPTH = 50.0
-# No depth sensor measures this near: a median below it means depth was scaled twice.
-MIN_MEDIAN_DEPTH = 0.005
-# With fewer returns within the sensor's range than this share, the unit is wrong, not the rest.
-_USABLE_SHARE = 0.05
-# What np.nan_to_num writes for infinity in single precision; no depth is as large.
-_INFINITE = float(np.finfo(np.float32).max)
+# Metres that no table-top sensor measures: medians beyond are millimetres, or depth scaled twice.
+MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.005, 50.0
+_USABLE_SHARE = 0.05  # of returns within the sensor's range: with fewer, the unit is wrong
+_INFINITE = float(np.finfo(np.float32).max)  # what np.nan_to_num makes of infinity
 _RIGID = 1e-3  # by how much a rotation may be off orthonormal
 
 
@@ -39,8 +35,7 @@ _RIGID = 1e-3  # by how much a rotation may be off orthonormal
 class Observation:
     """One segmented depth image with its camera, validated once, here.
 
-    Arrays, nested lists and torch tensors are accepted and copied, so a camera driver
-    that reuses its buffers cannot change an observation.
+    Arrays, nested lists and torch tensors are accepted, and copied: drivers reuse buffers.
 
     Attributes:
         depth: (H, W) float32 or float64, metres along the optical axis (not along the ray),
@@ -59,8 +54,7 @@ class Observation:
         warnings: what is usable but odd about this view, one sentence each with its remedy;
             handed on to the map, the world and every verdict.
         max_range: metres of depth beyond which a return is none: what lies there is a driver's
-            value for "no data", or a mirror. A ray that ends nowhere has seen nothing, one that
-            ends 65 m away has "seen" all before it free.
+            value for "no data", or a mirror, and must not make all before it free.
 
     Raises:
         ObservationError: what is wrong, what would be valid, and the remedy.
@@ -122,8 +116,7 @@ class Observation:
     def sees_robot(self) -> Pixels:
         """Pixels without a label whose point lies in one of `robot_spheres`.
 
-        What they see is neither an object nor background: it moves. The ray up to it is
-        free, and what lies behind it is hidden.
+        They see neither an object nor background; what lies behind is hidden.
         """
         seen = np.zeros(self.shape, dtype=bool)
         if self.robot_spheres is None:
@@ -140,8 +133,7 @@ class Observation:
         """Sorted positive labels that occur on at least one pixel with a return."""
         if self.labels is None:
             return ()
-        ids = np.unique(self.labels[self.depth > 0])
-        return tuple(int(i) for i in ids if i > 0)
+        return tuple(np.unique(self.labels[(self.depth > 0) & (self.labels > 0)]).tolist())
 
     def require_objects(self) -> tuple[int, ...]:
         """Return `object_ids`, or explain why there is nothing to map.
@@ -150,9 +142,7 @@ class Observation:
             ObservationError: unlabelled, all background, or labelled only where depth is 0.
         """
         if self.labels is None:
-            raise ObservationError(
-                "the observation has no labels; segment it first: segment_tabletop(obs)"
-            )
+            raise ObservationError("the observation has no labels; use segment_tabletop(obs)")
         if not self.object_ids:
             where = (
                 "every labelled pixel has no depth return (registered images?)"
@@ -242,18 +232,14 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
 def _check_scale(valid: np.ndarray, max_range: float) -> None:
     """Refuse returns (metres, all positive) that are in other units."""
     if valid.size == 0:
-        raise ObservationError(
-            "depth is 0, NaN or infinite everywhere: the sensor returned nothing to map"
-        )
+        raise ObservationError("depth is 0, NaN or infinite everywhere: there is nothing to map")
     usable = valid[valid <= max_range]
     # A value for "no data" may be in most pixels; it is the largest there is.
     body = valid[valid < valid.max()]
     median = float(np.median(body if body.size else valid))
     if median > MAX_MEDIAN_DEPTH and usable.size < _USABLE_SHARE * valid.size:
-        raise ObservationError(
-            f"median depth is {median:g} m, more than {MAX_MEDIAN_DEPTH:g} m: it looks like "
-            "millimetres; multiply by 0.001"
-        )
+        found = f"median depth is {median:g} m, more than {MAX_MEDIAN_DEPTH:g} m"
+        raise ObservationError(f"{found}: it looks like millimetres; multiply by 0.001")
     if usable.size == 0:
         raise ObservationError(
             f"every depth return lies beyond max_range = {max_range:g} m, the nearest at "
@@ -261,55 +247,42 @@ def _check_scale(valid: np.ndarray, max_range: float) -> None:
         )
     median = float(np.median(usable))
     if median < MIN_MEDIAN_DEPTH:
-        raise ObservationError(
-            f"median depth is {median:g} m, less than {MIN_MEDIAN_DEPTH:g} m: it looks as if "
-            "depth was scaled twice; give metres"
-        )
+        found = f"median depth is {median:g} m, less than {MIN_MEDIAN_DEPTH:g} m"
+        raise ObservationError(f"{found}: it looks as if depth was scaled twice; give metres")
 
 
 def check_labels(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return labels as a (H, W) int32 array of the depth's shape, 0 = background."""
     labels = to_numpy(value, "labels")
     if labels.shape != shape:
-        raise ObservationError(
-            f"labels have shape {labels.shape} but depth has {shape}; they must be one image "
-            "registered to the depth"
-        )
+        wanted = "they must be one image registered to the depth"
+        raise ObservationError(f"labels have shape {labels.shape} but depth {shape}; {wanted}")
     if labels.dtype.kind not in "iub":
-        raise ObservationError(
-            f"labels are {labels.dtype}; they must be integers: 0 background, 1, 2, ... objects"
-        )
-    if labels.dtype.kind == "i" and labels.min() < 0:
-        raise ObservationError(
-            f"labels contain {labels.min()}; they must be 0 (background) or positive object ids"
-        )
-    if labels.max() > np.iinfo(np.int32).max:
-        raise ObservationError(f"labels contain {labels.max()}; object ids must fit in int32")
+        wanted = "they must be integers: 0 background, 1, 2, ... objects"
+        raise ObservationError(f"labels are {labels.dtype}; {wanted}")
+    if labels.min() < 0 or labels.max() > np.iinfo(np.int32).max:
+        worst = labels.min() if labels.min() < 0 else labels.max()
+        wanted = "they must be 0 (background) or positive object ids that fit in int32"
+        raise ObservationError(f"labels contain {worst}; {wanted}")
     return np.ascontiguousarray(labels, dtype=np.int32)
 
 
 def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return a (3, 3) float64 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
     matrix = to_numpy(value, "intrinsics")
+    wanted = "it must be the 3x3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
     if matrix.shape != (3, 3):
-        raise ObservationError(
-            f"intrinsics have shape {matrix.shape}; they must be the 3x3 pinhole matrix "
-            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-        )
+        raise ObservationError(f"intrinsics: the matrix has shape {matrix.shape}; {wanted}")
     matrix = matrix.astype(np.float64)
     if not np.isfinite(matrix).all():
         raise ObservationError(f"intrinsics are not finite: {matrix.tolist()}")
     if not np.allclose(matrix[-1], [0, 0, 1], atol=1e-9):
-        raise ObservationError(
-            f"the last row of intrinsics is {matrix[-1].tolist()}; it must be [0, 0, 1] (is the "
-            "matrix transposed?)"
-        )
+        found = f"intrinsics: the matrix has the last row {matrix[-1].tolist()}"
+        raise ObservationError(f"{found}; {wanted} (is it transposed?)")
     (fx, skew, cx), (other_skew, fy, cy), _ = matrix
     if fx <= 0 or fy <= 0:
-        raise ObservationError(
-            f"intrinsics are singular: focal lengths fx = {fx:g}, fy = {fy:g} must be positive "
-            "pixels"
-        )
+        found = f"focal lengths fx = {fx:g}, fy = {fy:g}"
+        raise ObservationError(f"intrinsics are singular: {found} must be positive pixels")
     if max(abs(skew), abs(other_skew)) > 1e-6 * fx:
         raise ObservationError(
             f"intrinsics have skew ({skew:g}, {other_skew:g}); only a pinhole camera "

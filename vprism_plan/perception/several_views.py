@@ -19,15 +19,13 @@ from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.registration import Motion, Samples, explained, lay, look_up, samples_of
 
 # Metres at the objects by which a view may lie off the others: named beyond the first, refused
-# beyond the second. A turn about its camera of up to `TOLERATED_TURN` is no fault: hands and
-# eyes are calibrated no better.
+# beyond the second. A slight turn about its camera is no fault: hands and eyes are calibrated
+# no better.
 NAMED_OFFSET, REFUSED_OFFSET = 0.01, 0.05
 TOLERATED_TURN = np.radians(1.5)
 _NEAREST_VIEWS = 3  # that a view is laid on; more say nothing new
-_FEWEST = 200  # pairs of samples, below which nothing is said
-_SIGMAS = 4.0
+_FEWEST, _SIGMAS = 200, 4.0  # pairs of samples, below which nothing is said
 
-# Ids and motions.
 _SAME = 0.01  # metres between points of one surface
 _VOTES, _CLEAR, _AGREES = 50, 0.7, 0.3
 _BESIDE = 0.05  # metres between what may be one object
@@ -42,14 +40,11 @@ def agree(
 ) -> tuple[Observation, ...]:
     """Return views whose ids mean the same as in those before; `warnings` name what is odd.
 
-    Each view is compared with all before it:
-
-    - Laid on the nearest ones by the surfaces that both show, it lies off them by more
-      than `NAMED_OFFSET`, and turning its camera by `TOLERATED_TURN` does not explain it.
-    - Its ids lie on surfaces of other ids. Where that is clear it gets the ids of the
-      earlier views; an object that none of them knows keeps its id, or gets a free one
-      where that is taken.
-    - An object stands where another view looked through free space, or has shifted.
+    Named is where a view, laid on the nearest ones before it by the surfaces that both show,
+    lies off them by more than `NAMED_OFFSET` (a turn by `TOLERATED_TURN` apart), and where an
+    object stands where another view looked through free space, or has shifted. Ids that clearly
+    lie on surfaces of other ids become these; an object that no view before knows keeps its id,
+    or gets a free one where that is taken.
 
     Args:
         views: posed in one world frame, labelled.
@@ -96,10 +91,8 @@ def _compared(new: Samples, known: Sequence[Samples]) -> Samples:
         )
     for index in nearest:
         found += _moved(laid[index], known[index], (name, f"view {index + 1}"))
-    fresh = [text for text in found if text not in new.view.warnings]
-    if not fresh:
-        return new
-    return replace(new, view=replace(new.view, warnings=(*new.view.warnings, *fresh)))
+    said = tuple(dict.fromkeys([*new.view.warnings, *found]))
+    return replace(new, view=replace(new.view, warnings=said)) if found else new
 
 
 def _is_off(motion: Motion, camera: Vector) -> bool:
@@ -142,10 +135,9 @@ def _refuse(
 
 
 def _contradiction(new: Samples, known: Samples, margin: float) -> float:
-    """Share of what one view shows in space that the other saw to be free.
+    """Share of what one view shows in space that the other saw to be free; of objects if in both.
 
-    Of the surroundings, in the view where it is more; of objects only if nearly all of them
-    contradict, in both views: one that has moved does not make the pose wrong.
+    And if nearly all of them contradict: one that has moved does not make the pose wrong.
     """
     rest, objects = [0.0], []
     for ids, far in _in_free_space(new, known, margin):
@@ -189,12 +181,7 @@ def _moved(new: Samples, known: Samples, names: tuple[str, str]) -> list[str]:
 
 # ---------------------------------------------------------------------------------------- ids
 def _other_ids(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[dict[int, int], str]:
-    """Ids of a view for which those before it clearly have others, and what to say of it.
-
-    Args:
-        laid: the view as it lies on each of those before.
-        known: those before.
-    """
+    """Ids of a view (as laid on each before) for which those clearly have others; what to say."""
     ids = np.unique(laid[0].ids[laid[0].ids > 0]).tolist()
     points, owner = (np.concatenate([getattr(k, n) for k in known]) for n in ("points", "ids"))
     old = np.unique(owner[owner > 0]).tolist()

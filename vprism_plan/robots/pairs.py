@@ -11,6 +11,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Bool, Float
 
+from vprism_plan._arguments import whole
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import Configurations, Indices, Pairs
 from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
@@ -46,8 +47,8 @@ def choose_pairs(
         samples: Random configurations, where there is none.
 
     Returns:
-        (P, 2) indices into the links with spheres, first < second, sorted; all other pairs,
-        with the reasons; and of these the ones that random configurations showed.
+        The tested pairs, first < second, sorted; all others with the reasons; and of these the
+        ones that random configurations showed.
     """
     names = tuple(chosen.rows)
     everything = list(combinations(range(len(names)), 2))
@@ -62,8 +63,7 @@ def choose_pairs(
     if stated is not None:
         sampled = _touching_fits(arrays, pairs, chosen)
     else:
-        if samples < 1:
-            raise RobotError(f"matrix_samples is {samples}; at least 1 configuration is needed")
+        whole("matrix_samples", samples, 1, error=RobotError)
         sampled = sampled_reasons(arrays, pairs, names, samples)
         always = [tuple(sorted(pair)) for pair, why in sampled.items() if why == ALWAYS]
         if always:
@@ -122,12 +122,10 @@ def sampled_reasons(
 ) -> dict[frozenset[str], str]:
     """Pairs that overlap always, and pairs that never come near each other.
 
-    "Always": the spheres overlap at the joints' zero and in every random configuration. The
-    pair does so because of how the links are built, or of how coarse the spheres are;
-    testing it would refuse every pose. "Never": the spheres are 5 cm apart in every one, and
-    stay so when the joints are moved downhill from the nearest. A sample proves neither:
-    a pair that comes near in a corner of the joint space only can be missed, so what is in
-    between, and what was nearer just once, stays tested.
+    "Always": the spheres overlap at the joints' zero and in every random configuration, because
+    of how the links are built or how coarse the spheres are; testing it would refuse every
+    pose. "Never": the spheres are 5 cm apart in every one, and stay so when the joints are moved
+    downhill from the nearest. A sample proves neither, so what is in between stays tested.
     """
     rng = np.random.default_rng(0)
     q = _zero_and_random(arrays, samples - 1, rng)
@@ -229,8 +227,7 @@ def _of_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
 def pairs_touching(
     arrays: KinematicArrays, q: Configurations, pairs: Pairs
 ) -> Bool[np.ndarray, "n pairs"]:
-    """For each configuration and link pair, whether any of their spheres overlap, padding
-    not counted."""
+    """Whether any spheres of each pair overlap in each configuration, padding not counted."""
     return pair_gaps(arrays, q, pairs) < 0.0
 
 
