@@ -6,20 +6,9 @@ metres; pixel (u, v) = (column, row), and a whole number is the *centre* of a pi
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, Num
+from jaxtyping import Float, Int, Num
 
-# What this package hands around.
-Vector = Float[np.ndarray, " 3"]
-Matrix = Float[np.ndarray, "3 3"]
-Pose = Float[np.ndarray, "4 4"]
-Image = Float[np.ndarray, "h w"]
-Pixels = Bool[np.ndarray, "h w"]
-Ids = Int32[np.ndarray, "h w"]
-PointImage = Float[np.ndarray, "h w 3"]
-Points = Float[np.ndarray, "n 3"]
-Values = Float[np.ndarray, " n"]
-Chosen = Bool[np.ndarray, " n"]
-Indices = Int[np.ndarray, " n"]
+from vprism_plan._shapes import Chosen, Image, Matrix, PointImage, Points, Pose, Values, Vector
 
 
 def pixel_rays(shape: tuple[int, int], intrinsics: Matrix) -> PointImage:

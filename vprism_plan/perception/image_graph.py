@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vprism_plan.perception.camera import Image, Indices, Matrix, Pixels, stereo_noise
+from vprism_plan._shapes import Image, Indices, Matrix, Pixels
+from vprism_plan.perception.camera import stereo_noise
 
 # Offsets (rows, columns) of half of the eight neighbours; the other half is symmetric.
 _HALF = ((0, 1), (1, 0), (1, 1), (1, -1))

@@ -15,19 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 from scipy import ndimage
 
-from vprism_plan.perception.camera import (
-    Chosen,
-    Ids,
-    Image,
-    Indices,
-    Pixels,
-    PointImage,
-    Points,
-    depth_sigma,
-    inlier_band,
-    lift,
-    pixel_rays,
-)
+from vprism_plan._shapes import Chosen, Ids, Image, Indices, Pixels, PointImage, Points
+from vprism_plan.perception.camera import depth_sigma, inlier_band, lift, pixel_rays
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane, least_squares_plane, refine
 from vprism_plan.perception.plane_fitting import standing_on

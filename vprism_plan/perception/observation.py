@@ -9,17 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from vprism_plan._arguments import number, rigid_pose
+from vprism_plan._shapes import Pixels, PointImage, Points, Pose, Vector
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.camera import (
-    Pixels,
-    PointImage,
-    Points,
-    Pose,
-    Vector,
-    backproject,
-    point_image,
-    within_balls,
-)
+from vprism_plan.perception.camera import backproject, point_image, within_balls
 from vprism_plan.perception.plane import Plane
 
 # Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan._read_only import make_read_only
+from vprism_plan._shapes import Chosen, Points, Pose, Values, Vector
 from vprism_plan.errors import ObservationError, PlaneNotFoundError
-from vprism_plan.perception.camera import Chosen, Points, Pose, Values, Vector
 
 _CELL, _REGION_CELL = 0.04, 0.02  # metres, of an extent and of a table top
 _BRIDGE = 5  # cells: gaps in the visible table (objects and their shadows) do not split it

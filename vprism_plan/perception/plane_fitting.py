@@ -12,16 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from vprism_plan._arguments import number
+from vprism_plan._shapes import Chosen, Points, Values, Vector
 from vprism_plan.errors import ObservationError, PlaneNotFoundError
-from vprism_plan.perception.camera import (
-    Chosen,
-    Points,
-    Values,
-    Vector,
-    backproject,
-    inlier_band,
-    invert_transform,
-)
+from vprism_plan.perception.camera import backproject, inlier_band, invert_transform
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane, facing, over_extent, refine
 

@@ -7,15 +7,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from vprism_plan._shapes import Chosen, Image, Indices, Matrix, Points, Pose, Values, Vector
 from vprism_plan.perception.camera import (
-    Chosen,
-    Image,
-    Indices,
-    Matrix,
-    Points,
-    Pose,
-    Values,
-    Vector,
     depth_sigma,
     invert_transform,
     lift,

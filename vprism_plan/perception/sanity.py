@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
+from vprism_plan._shapes import Chosen, Points, Vector
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.camera import Chosen, Points, Vector, inlier_band, pixel_rays
+from vprism_plan.perception.camera import inlier_band, pixel_rays
 from vprism_plan.perception.masks import mend
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane, in_grid, least_squares_plane

@@ -13,16 +13,9 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from vprism_plan._arguments import number, whole
+from vprism_plan._shapes import Indices, Pixels, PointImage, Points, Values
 from vprism_plan.errors import ConfigError, PlaneNotFoundError
-from vprism_plan.perception.camera import (
-    Indices,
-    Pixels,
-    PointImage,
-    Points,
-    Values,
-    inlier_band,
-    stereo_noise,
-)
+from vprism_plan.perception.camera import inlier_band, stereo_noise
 from vprism_plan.perception.image_graph import (
     SurfaceImage,
     components,

@@ -9,11 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._arguments import number
+from vprism_plan._shapes import Pixels, Points, Values
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import (
-    Pixels,
-    Points,
-    Values,
     backproject,
     invert_transform,
     project,

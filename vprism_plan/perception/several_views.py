@@ -13,8 +13,9 @@ from jaxtyping import Int
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from vprism_plan._shapes import Values, Vector
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.camera import Values, Vector, transform_points
+from vprism_plan.perception.camera import transform_points
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.registration import Motion, Samples, explained, lay, look_up, samples_of
 

@@ -13,16 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan._arguments import number, rigid_pose, whole
+from vprism_plan._shapes import Pairs, Points, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import (
-    Pairs,
-    Points,
-    Spheres,
-    Triangles,
-    Values,
-    Vector,
-    read_triangles,
-)
+from vprism_plan.robots.geometry import read_triangles
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from vprism_plan._files import reading
+from vprism_plan._shapes import Points, Pose, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.plain_xml import refuse_growing_scene
 
@@ -27,17 +27,6 @@ _FORMATS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb", ".gltf")
 # What rounding makes of triangles without any, as a share of the extent squared.
 _NO_AREA = 1e-12
 _logger = logging.getLogger(__name__)
-
-# What this package hands around; lengths are metres, spheres rows (x, y, z, radius).
-Vector = Float[np.ndarray, "3"]
-Pose = Float[np.ndarray, "4 4"]
-Points = Float[np.ndarray, "n 3"]
-Values = Float[np.ndarray, " n"]
-Indices = Int[np.ndarray, " n"]
-Spheres = Float[np.ndarray, "n 4"]
-Triangles = Float[np.ndarray, "f 3 3"]
-Pairs = Int[np.ndarray, "pairs 2"]
-Configurations = Float[np.ndarray, "n dof"]
 
 PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | None
 """Where packages are: folders that hold them (or are them), or package -> its folder."""

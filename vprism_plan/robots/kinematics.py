@@ -11,16 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan._read_only import make_read_only
+from vprism_plan._shapes import Configurations, Indices, Points, Pose, Spheres, Values, Vector
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import (
-    Configurations,
-    Indices,
-    Points,
-    Pose,
-    Spheres,
-    Values,
-    Vector,
-)
 from vprism_plan.robots.sphere_files import LinkSpheres
 from vprism_plan.robots.urdf import RobotModel
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan._arguments import whole
+from vprism_plan._shapes import Configurations, Indices, Pairs
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import Configurations, Indices, Pairs
 from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
 from vprism_plan.robots.sphere_files import ChosenSpheres
 from vprism_plan.robots.srdf import RIGID

@@ -10,14 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from vprism_plan.robots.geometry import (
-    MeshFile,
-    Points,
-    PrimitiveGeometry,
-    Spheres,
-    Triangles,
-    Values,
-)
+from vprism_plan._shapes import Points, Spheres, Triangles, Values
+from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
 from vprism_plan.robots.surfaces import (
     Surface,
     halved_triangles,

@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import rigid_pose
 from vprism_plan._read_only import make_read_only
+from vprism_plan._shapes import Pairs, Pose
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import changes, pairs, surfaces
 from vprism_plan.robots.changes import Held
-from vprism_plan.robots.geometry import MeshFile, PackageDirs, Pairs, Pose, PrimitiveGeometry
+from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from vprism_plan._files import reading, write_text
+from vprism_plan._shapes import Spheres
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import Spheres
 from vprism_plan.robots.sphere_fit import SphereFit, enclosing_spheres, fit_spheres
 from vprism_plan.robots.surfaces import link_triangles
 from vprism_plan.robots.urdf import RobotModel

@@ -25,16 +25,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan._arguments import number, whole
+from vprism_plan._shapes import Indices, Points, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import (
-    Indices,
-    Points,
-    PrimitiveGeometry,
-    Spheres,
-    Triangles,
-    Values,
-    Vector,
-)
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.surfaces import Surface, with_hull
 
 _MOST, _ARM_SIZED = 12, 0.35

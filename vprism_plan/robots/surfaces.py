@@ -13,17 +13,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from vprism_plan._shapes import Points, Pose, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.geometry import (
-    MeshFile,
-    Points,
-    Pose,
-    PrimitiveGeometry,
-    Spheres,
-    Triangles,
-    Values,
-    Vector,
-)
+from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
 
 # Cells along the edge of a cube as large as a link's box, and along its longest edge.
 _CELLS, _FEWEST, _MOST_CELLS = 14, 18, 40
