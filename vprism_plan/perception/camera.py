@@ -6,7 +6,7 @@ metres; pixel (u, v) = (column, row), and a whole number is the *centre* of a pi
 """
 
 import numpy as np
-from jaxtyping import Float, Int, Num
+from jaxtyping import Float, Num
 
 from vprism_plan._shapes import Chosen, Image, Matrix, PointImage, Points, Pose, Values, Vector
 
@@ -32,12 +32,7 @@ def point_image(depth: Image, intrinsics: Matrix, T_world_camera: Pose) -> Point
     return transform_points(T_world_camera, backproject(depth, intrinsics))
 
 
-def lift(
-    depth: Image,
-    intrinsics: Matrix,
-    row: Int[np.ndarray, "*some"],
-    column: Int[np.ndarray, "*some"],
-) -> Float[np.ndarray, "*some 3"]:
+def lift(depth: Image, intrinsics: Matrix, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Return the camera-frame points (metres) of some pixels, 0 where there is no return."""
     z = depth[row, column].astype(np.float64)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0] * z
@@ -46,12 +41,7 @@ def lift(
 
 
 def project(points: Points, intrinsics: Matrix) -> tuple[Float[np.ndarray, "n 2"], Values]:
-    """Project camera-frame points (metres).
-
-    Returns:
-        Pixel coordinates (u, v), NaN for points in or behind the camera plane (z <= 0),
-        and the depth z of every point (metres, may be negative).
-    """
+    """Project camera-frame points (metres) to pixels (u, v), NaN where z <= 0; return z as well."""
     z = points[:, 2].astype(np.float64)
     safe = np.where(z > 0, z, np.nan)
     u = intrinsics[0, 0] * points[:, 0] / safe + intrinsics[0, 2]
@@ -129,9 +119,7 @@ def stereo_noise(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shap
     return np.asarray(0.002 * np.maximum(0.5, np.asarray(depth, dtype=np.float64)) ** 2)
 
 
-def inlier_band(
-    depth: Float[np.ndarray, "*shape"], threshold: float
-) -> Float[np.ndarray, "*shape"]:
+def inlier_band(depth: np.ndarray, threshold: float) -> np.ndarray:
     """Half-width (metres) of the band in which a point at this depth counts as on a plane.
 
     Several times the noise, as a table is not flat: `threshold` up to 1 m, beyond it
@@ -144,10 +132,7 @@ def inlier_band(
 def height_sigma(rays: Points, depth: Values, normal: Vector) -> Values:
     """Standard deviation of the depth noise as it shows along a surface's normal, metres.
 
-    Args:
-        rays: from the camera to what it saw, metres, in the frame of `normal`.
-        depth: of these points, metres.
-        normal: unit vector.
+    `rays` go from the camera to what it saw at these depths, in the frame of the unit `normal`.
     """
     return np.asarray(depth_sigma(depth) * (np.abs(rays @ normal) / depth))
 
@@ -159,12 +144,8 @@ def undistort(
     """Return an image (H, W, ...) as a pinhole camera of the same intrinsics sees it.
 
     By nearest pixel: to blend the depths or the ids of two sides of an edge would invent
-    surfaces. Pixels that the lens did not see are 0: no return, background.
-
-    Args:
-        image: as the lens shows it.
-        coefficients: k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order).
-        intrinsics: valid for the image.
+    surfaces. Pixels that the lens did not see are 0: no return, background. Coefficients are k1
+    k2 p1 p2 k3 k4 k5 k6 (OpenCV's order).
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     (fx, _, cx), (_, fy, cy), _ = intrinsics

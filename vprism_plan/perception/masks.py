@@ -47,11 +47,7 @@ def drop_background(views: Sequence[Observation], first: int = 0) -> tuple[Obser
     These are void values (255, 65535) that outline the other objects or fill all that they
     leave, and labels whose points lie on one plane far larger than an object, or one that
     the other objects stand on: a wall, the table. They become 0. Call it before the support
-    plane is fitted: that leaves out what carries a label.
-
-    Args:
-        views: labelled or not.
-        first: number of views that came before, for the wording.
+    plane is fitted, with the number of views that came before, for the wording.
     """
     return _each(views, first, _without_background)
 

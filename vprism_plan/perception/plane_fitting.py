@@ -9,7 +9,8 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
+from numpy.random import Generator
 
 from vprism_plan._arguments import number
 from vprism_plan._shapes import Chosen, Points, Values, Vector
@@ -86,7 +87,7 @@ def fit_plane(
     chosen = _choose(len(standing), rng)
     band = inlier_band(sample[:, 2], threshold)
     everywhere = np.ones(len(sample), dtype=bool)
-    candidates, rejected = _peel(sample, band, everywhere, min_share, rng)
+    candidates, rejected = _peel(sample, band, everywhere, min_share, rng, None)
     candidates += _overlooked(candidates, sample, band, min_share, rng, obs)
     if not candidates:
         raise PlaneNotFoundError(_why_not(rejected, min_share))
@@ -115,7 +116,7 @@ def fit_plane(
     return plane.transformed(obs.pose)
 
 
-def _choose(count: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
+def _choose(count: int, rng: Generator) -> Int[np.ndarray, " m"]:
     if count <= _MAX_POINTS:
         return np.arange(count)
     return np.sort(rng.choice(count, size=_MAX_POINTS, replace=False))
@@ -133,12 +134,7 @@ def _is_level(plane: Plane, obs: Observation) -> bool:
 
 # ------------------------------------------------------------------------- planes among points
 def _peel(
-    points: Points,
-    band: Values,
-    among: Chosen,
-    min_share: float,
-    rng: np.random.Generator,
-    up: Vector | None = None,
+    points: Points, band: Values, among: Chosen, min_share: float, rng: Generator, up: Vector | None
 ) -> tuple[list[_Candidate], list[tuple[float, float]]]:
     """Peel the largest (level) planes off some of the points; return share, `below` of others."""
 
@@ -178,7 +174,7 @@ def _overlooked(
     points: Points,
     band: Values,
     min_share: float,
-    rng: np.random.Generator,
+    rng: Generator,
     obs: Observation,
 ) -> list[_Candidate]:
     """Surfaces that the band mixed, as a bin's floor and walls, and small level ones if posed."""
@@ -205,7 +201,7 @@ def _concentration(plane: Plane, points: Points, band: Values) -> float:
 
 
 def _find_plane(
-    points: Points, band: Values, rng: np.random.Generator, up: Vector | None
+    points: Points, band: Values, rng: Generator, up: Vector | None
 ) -> _Candidate | None:
     """Return the plane with most points in its band, or None if no triple spans one.
 
@@ -242,9 +238,7 @@ def _find_plane(
     return best
 
 
-def _hypotheses(
-    points: Points, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
+def _hypotheses(points: Points, rng: Generator) -> tuple[Points, Values]:
     """Normals and offsets of planes through triples of points, degenerate triples dropped."""
     from scipy.spatial import cKDTree
 

@@ -46,17 +46,13 @@ def ignore_robot(
 
     Unlabelled pixels within the padded balls become neither objects nor background
     obstacles, and do not vote for the support plane. The rays up to them remain free space,
-    and what lies behind them is occluded, as behind anything that was seen. Hidden space in
-    the balls themselves, without padding, is free: the robot was there.
+    and what lies behind them is occluded. Hidden space in the balls themselves, without
+    padding, is free: the robot was there.
 
     That is your word. Balls that stand out of the robot give away space that nobody saw: for a
     robot with a URDF, use `ignore_self`. What is seen outranks it: a label within the balls
     stays and is an obstacle, and behind what was seen in the balls or within 10 cm of them no
     hidden space is free.
-
-    `padding` is for the errors of the camera's pose and the sensor's noise. For the pictured
-    configuration to be valid, hidden space around its spheres must be free as well: `room`
-    of the checker's margin and twice the world's resolution is enough.
 
     Called again (a second robot, a tool), it adds to what is marked. Call it after labelling.
 
@@ -64,8 +60,10 @@ def ignore_robot(
         observation: Posed, or else `centers` are in the camera frame.
         centers: (S, 3) world, metres; array or tensor.
         radii: (S,) metres.
-        padding: Metres beyond the balls in which a pixel still sees the robot.
-        room: Metres beyond the balls in which hidden space is free, by your word.
+        padding: Metres beyond the balls in which a pixel still sees the robot: the error of the
+            camera's pose, and the sensor's noise.
+        room: Metres beyond the balls in which hidden space is free, by your word: the checker's
+            margin and twice the world's resolution make the pictured configuration valid.
         remove_flying: Whether flying pixels, which sensors invent between the robot and what
             lies behind it, become "no return" within two pixels of one that sees the robot:
             they would be obstacles in mid-air.
@@ -108,16 +106,15 @@ def ignore_self(
     and the meshes of attached objects, without padding and scale. An unlabelled pixel sees the
     robot if its point is within `padding` and three standard deviations of the depth noise
     of a solid. Hidden space inside the solids is free; beside and behind them it stays hidden.
-
     A label of which nine tenths lie on the surface of the solids, within the noise, is the
     robot's and becomes 0. All others stay, and are obstacles.
 
     The collision spheres of a checker stand out of the solids, so in the shadow of its own
     links the pictured configuration is usually refused as "occluded". `room` is your word
-    that nothing is there: hidden space within the robot's collision spheres and `room` metres
-    around them is free, but not behind things that were seen in it or near it. Give the
-    robot that will be checked, with its padding and what it holds; the checker's margin and
-    twice the world's resolution are enough (0.02 by default).
+    that nothing is there: hidden space within the collision spheres (of the robot that will be
+    checked, with its padding and what it holds) and `room` metres around them is free, but not
+    behind things that were seen near it. The checker's margin and twice the world's resolution
+    are enough (0.02 by default).
 
     Args:
         observation: Posed in the world in which the robot's base stands, and labelled if it
@@ -125,10 +122,8 @@ def ignore_self(
         robot: A `Robot`; of anything else `sphere_centers(q)` (torch tensor (dof,) -> (S, 3),
             world, metres) and `sphere_radii` (S,) count.
         q: (dof,) radians or metres.
-        padding: Metres beyond the solids in which a pixel still sees the robot: the error of
-            the camera's pose, and of the URDF.
+        padding, remove_flying: See `ignore_robot`.
         room: Metres around the collision spheres, or None for no such word.
-        remove_flying: See `ignore_robot`.
 
     Returns:
         The observation with `robot_spheres` set, and `warnings` of what is odd: links without

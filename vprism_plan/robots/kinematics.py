@@ -40,19 +40,18 @@ class KinematicArrays:
 
     Attributes:
         base_R: Rotation of the base in the world.
-        base_t: Position of the base in the world, metres.
+        base_t: Position of the base in the world.
         parent: Parent frame, -1 for frame 0.
         R_off: Joint frame in its parent frame at joint value 0, rotation.
-        t_off: The same, translation in metres.
+        t_off: The same, translation.
         axis: Unit joint axis in the joint frame.
         kind: 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic.
         q_index: Index into the configuration, -1 for frame 0.
         q_mult: Factor on the configuration value (1 unless the joint mimics).
         q_offset: Offset added to it (0 unless the joint mimics).
         sphere_frame: Frame each sphere moves with.
-        sphere_center: Centre in that frame, metres.
-        sphere_radius: Radius, metres. Spheres are sorted by (link, radius
-            falling), so the spheres of a link are contiguous.
+        sphere_center: Centre in that frame.
+        sphere_radius: Radius. Spheres are sorted by link, and in it by falling radius.
         sphere_link: Index into the robot's ``link_names``.
         link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
         link_frame: Frame each link moves with.

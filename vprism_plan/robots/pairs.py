@@ -9,16 +9,17 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from numpy.random import Generator
 
 from vprism_plan._arguments import whole
-from vprism_plan._shapes import Configurations, Indices, Pairs
+from vprism_plan._shapes import Configurations, Indices, Pairs, Values
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
 from vprism_plan.robots.sphere_files import ChosenSpheres
 from vprism_plan.robots.srdf import RIGID
 from vprism_plan.robots.urdf import RobotModel
 
+Reasons = dict[frozenset[str], str]  # unordered pair of links -> why it is not tested
 ADJACENT, ALWAYS, NEVER = "Adjacent", "Always", "Never"
 SAMPLES = 10_000
 # "Never" asks for so much room in every sample, metres, and after a search for less.
@@ -35,14 +36,12 @@ def choose_pairs(
     chosen: ChosenSpheres,
     stated: Mapping[frozenset[str], str] | None,
     samples: int,
-) -> tuple[Pairs, dict[frozenset[str], str], dict[frozenset[str], str]]:
+) -> tuple[Pairs, Reasons, Reasons]:
     """Which pairs of links are tested: all but adjacent, rigid and disabled ones, and those that
     random configurations show to need no test.
 
     Args:
-        model: The tree.
-        arrays: The robot.
-        chosen: Its spheres.
+        model, arrays, chosen: The robot, and its spheres.
         stated: The pairs that an SRDF disables; None where there is no SRDF.
         samples: Random configurations, where there is none.
 
@@ -87,9 +86,7 @@ def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
     return pairs
 
 
-def _touching_fits(
-    arrays: KinematicArrays, pairs: Pairs, chosen: ChosenSpheres
-) -> dict[frozenset[str], str]:
+def _touching_fits(arrays: KinematicArrays, pairs: Pairs, chosen: ChosenSpheres) -> Reasons:
     """Pairs that an SRDF wants tested, and whose fitted spheres overlap in every pose."""
     names = tuple(chosen.rows)
     made = np.array([chosen.sources[name] in ("fitted", "tiled") for name in names])
@@ -119,7 +116,7 @@ def hangs_on(model: RobotModel, joints: Collection[str], pair: frozenset[str]) -
 
 def sampled_reasons(
     arrays: KinematicArrays, pairs: Pairs, names: Sequence[str], samples: int
-) -> dict[frozenset[str], str]:
+) -> Reasons:
     """Pairs that overlap always, and pairs that never come near each other.
 
     "Always": the spheres overlap at the joints' zero and in every random configuration, because
@@ -150,13 +147,11 @@ def sampled_reasons(
     return _named(pairs[always], names, ALWAYS) | _named(pairs[far], names, NEVER)
 
 
-def _named(pairs: Pairs, names: Sequence[str], reason: str) -> dict[frozenset[str], str]:
+def _named(pairs: Pairs, names: Sequence[str], reason: str) -> Reasons:
     return {frozenset((names[a], names[b])): reason for a, b in pairs}
 
 
-def pair_gaps(
-    arrays: KinematicArrays, q: Configurations, pairs: Pairs
-) -> Float[np.ndarray, "n pairs"]:
+def pair_gaps(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.ndarray:
     """Distance between the spheres of two links in each configuration, padding not counted.
 
     Beyond :data:`ROOM` it is a lower bound: that of the balls around the links' spheres.
@@ -177,11 +172,8 @@ def pair_gaps(
 
 
 def _least_gaps(
-    arrays: KinematicArrays,
-    starts: Float[np.ndarray, "pairs starts dof"],
-    pairs: Pairs,
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "pairs"]:
+    arrays: KinematicArrays, starts: np.ndarray, pairs: Pairs, rng: Generator
+) -> Values:
     """The smallest gaps that random steps downhill from these configurations lead to."""
     span, least = arrays.upper - arrays.lower, np.full(len(pairs), np.inf)
     both = np.array([[0, 1]])
@@ -224,15 +216,13 @@ def _of_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
     )
 
 
-def pairs_touching(
-    arrays: KinematicArrays, q: Configurations, pairs: Pairs
-) -> Bool[np.ndarray, "n pairs"]:
+def pairs_touching(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.ndarray:
     """Whether any spheres of each pair overlap in each configuration, padding not counted."""
     return pair_gaps(arrays, q, pairs) < 0.0
 
 
 def touching_pairs(
-    arrays: KinematicArrays, q: Float[np.ndarray, "dof"], names: Sequence[str]
+    arrays: KinematicArrays, q: Values, names: Sequence[str]
 ) -> set[tuple[str, str]]:
     """Names of the tested pairs whose spheres overlap at one configuration."""
     touching = pairs_touching(arrays, q[None], arrays.pairs)[0]
@@ -245,22 +235,16 @@ def touching_shares(
     """See :meth:`Robot.touching_shares`."""
     q = random_configurations(arrays, samples, np.random.default_rng(seed))
     shares = pairs_touching(arrays, q, arrays.pairs).mean(axis=0)
-    return {
-        frozenset((names[a], names[b])): float(share)
-        for (a, b), share in zip(arrays.pairs, shares, strict=True)
-    }
+    pairs = [frozenset((names[a], names[b])) for a, b in arrays.pairs]
+    return dict(zip(pairs, shares.tolist(), strict=True))
 
 
-def random_configurations(
-    arrays: KinematicArrays, n: int, rng: np.random.Generator
-) -> Configurations:
+def random_configurations(arrays: KinematicArrays, n: int, rng: Generator) -> Configurations:
     """Uniform configurations within the limits."""
     return rng.uniform(arrays.lower, arrays.upper, size=(n, len(arrays.lower)))
 
 
-def _zero_and_random(
-    arrays: KinematicArrays, n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "m dof"]:
+def _zero_and_random(arrays: KinematicArrays, n: int, rng: Generator) -> Configurations:
     """The joints' zero, or the limit next to it, and n random configurations."""
     at_zero = np.clip(np.zeros(len(arrays.lower)), arrays.lower, arrays.upper)
     return np.vstack([at_zero, random_configurations(arrays, n, rng)])

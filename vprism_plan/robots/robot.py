@@ -60,10 +60,10 @@ class Robot:
         named_states: SRDF states that fix every joint of ``joint_names``.
         groups: SRDF group -> names of its links: the children of its joints and the links
             it names, with or without spheres (:meth:`links_of` gives those with spheres).
-        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's; with
-            an SRDF or without, "Adjacent" for links joined by a joint (also through links
-            without spheres) and "Rigid" for links that no joint moves against each other;
-            "Always" and "Never" of random configurations; or what :meth:`attach` says.
+        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's;
+            "Adjacent" for links joined by a joint (also through links without spheres);
+            "Rigid" for links that no joint moves against each other; "Always" and "Never" of
+            random configurations; or what :meth:`attach` says.
         arrays: The flat form that compiled kernels read.
         meshes: Link name -> its collision meshes, read when they are asked for; scaled as
             the robot is, without its padding, by which nothing grows a mesh.
@@ -376,17 +376,16 @@ class Robot:
         """The same robot with larger (or smaller) links, scaled first and then padded.
 
         Padding adds to the radius of every sphere, so clearance falls by exactly that much;
-        solids of ``geometry`` are grown by it all around. A scale moves spheres and solids
-        of a link away from (or towards) the centre of the ball around the link's spheres
-        and multiplies their size; above 1, spheres are widened so that they also hold what
-        they held before. Scaled and padded spheres hold the scaled and padded solids.
+        solids of ``geometry`` are grown by it all around. A scale moves spheres and solids of a
+        link away from (or towards) the centre of the ball around the link's spheres and
+        multiplies their size. Scaled and padded spheres hold the scaled and padded solids, and
+        what they held before.
 
         As in MoveIt, padding counts against the world only: links may come as near to each
-        other as before. MoveIt differs in three ways: it scales every shape about the
-        shape's own origin; its padding moves each face of a box outward, corners farther,
-        where ours is a distance in every direction; and it leaves the scale out of
-        self-collision, where ours counts (pairs that then touch at ``neutral`` are logged).
-        A scale above 1 makes generated "Never" pairs of that link tested again.
+        other as before. MoveIt differs in three ways: it scales every shape about its own
+        origin; its padding moves each face of a box outward, corners farther; and it leaves the
+        scale out of self-collision, where ours counts (pairs that then touch at ``neutral`` are
+        logged). A scale above 1 makes generated "Never" pairs of that link tested again.
 
         Args:
             padding: Metres, 0 or more: one number, or a table by link or group whose other
