@@ -26,6 +26,7 @@ _MOST_TRIANGLES = 10_000_000
 _FORMATS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb", ".gltf")
 # What rounding makes of triangles without any, as a share of the extent squared.
 _NO_AREA = 1e-12
+_REMEDY = "give a mesh file with a surface, or spheres= for the link"
 _logger = logging.getLogger(__name__)
 
 PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | None
@@ -44,11 +45,7 @@ class MeshFile:
     searched: tuple[str, ...] = ()  # where it was looked for
 
     def require(self) -> Path:
-        """Return the file.
-
-        Raises:
-            RobotError: There is none; the message says where it was looked for.
-        """
+        """Return the file, or raise RobotError that says where it was looked for."""
         if self.path is None:
             raise RobotError(
                 f"link '{self.link}' has the mesh '{self.filename}' as collision geometry, and "
@@ -66,8 +63,7 @@ class MeshFile:
         """The mesh as a ``trimesh.Trimesh`` in the link's frame, metres, vertices merged.
 
         Raises:
-            RobotError: See :meth:`require`; or the file cannot be read, holds no triangle
-                with an area, or is too large to be in metres.
+            RobotError: The file is missing, unreadable, without area, or too large for metres.
         """
         import trimesh
 
@@ -85,10 +81,8 @@ class MeshFile:
                 local.invert()
             extent = float(np.ptp(read_triangles(local, what, _LONGEST_LINK), axis=(0, 1)).max())
             if not local.area > _NO_AREA * extent**2:
-                raise RobotError(
-                    f"{what}: the mesh has no area, its triangles are lines or points; give a "
-                    "mesh file with a surface, or spheres= for the link"
-                )
+                found = "the mesh has no area, its triangles are lines or points"
+                raise RobotError(f"{what}: {found}; {_REMEDY}")
             return local
 
     def triangles(self) -> Triangles:
@@ -108,10 +102,7 @@ def _loaded(path: Path, what: str) -> Any:
     units = scene.units if path.suffix.lower() == ".dae" else None
     mesh = scene.to_mesh()
     if len(mesh.faces) == 0:
-        raise RobotError(
-            f"{what}: '{path}' holds no triangles; give a mesh file with a surface, or spheres= "
-            "for the link"
-        )
+        raise RobotError(f"{what}: '{path}' holds no triangles; {_REMEDY}")
     if units not in (None, "meters"):
         import trimesh
 
@@ -252,19 +243,13 @@ class PrimitiveGeometry:
 
 
 def read_scene(path: Path) -> Any:
-    """What a mesh file holds, as a ``trimesh.Scene``; call it inside of `reading`.
-
-    Raises:
-        RobotError: Another format, or more triangles than any link has. Else whatever the
-            format's reader raises.
-    """
+    """What a mesh file holds, as a ``trimesh.Scene``; call it inside of `reading`."""
     import trimesh
 
     format = path.suffix.lower()
     if format not in _FORMATS:
-        raise RobotError(
-            f"'{path}' is a mesh of format {format!r}; formats that are read: {', '.join(_FORMATS)}"
-        )
+        valid = f"formats that are read: {', '.join(_FORMATS)}"
+        raise RobotError(f"'{path}' is a mesh of format {format!r}; {valid}")
     if format == ".dae":
         refuse_growing_scene(path)
     # Processing would cut out vertices that are not finite, and their faces, in silence.

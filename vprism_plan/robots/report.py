@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vprism_plan._shapes import Points, Spheres, Triangles, Values
-from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.surfaces import (
     Surface,
     halved_triangles,
@@ -104,14 +104,12 @@ class RobotReport:
         header = ("link", "spheres", "from", "enclosed", "coverage", "stands out", "mean")
         rows = [header, *map(_row, self.links)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = []
-        for row in rows:
-            cells = (
-                cell.rjust(width) if c in (1, 4, 5, 6) else cell.ljust(width)
-                for c, (cell, width) in enumerate(zip(row, widths, strict=True))
-            )
-            lines.append("  ".join(cells).rstrip())
-        return "\n".join(lines)
+        aligned = (str.ljust, str.rjust, str.ljust, str.ljust, str.rjust, str.rjust, str.rjust)
+        lines = (
+            "  ".join(a(cell, w) for a, cell, w in zip(aligned, row, widths, strict=True))
+            for row in rows
+        )
+        return "\n".join(line.rstrip() for line in lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
@@ -120,8 +118,8 @@ class RobotReport:
 
 
 def _row(link: LinkReport) -> tuple[str, ...]:
-    def millimetres(value: float | None) -> str:
-        return "-" if value is None else f"{1000.0 * value:.1f} mm"
+    def text(value: float | None, factor: float, unit: str) -> str:
+        return "-" if value is None else f"{factor * value:.1f} {unit}"
 
     if link.unchecked:
         verdict = "NOT CHECKED"
@@ -129,15 +127,9 @@ def _row(link: LinkReport) -> tuple[str, ...]:
         verdict = "mesh missing" if link.missing else "no geometry"
     else:
         verdict = "proved" if link.enclosed else f"no, {1000.0 * (link.bare or 0.0):.1f} mm bare"
-    return (
-        link.link,
-        str(link.spheres),
-        link.source,
-        verdict,
-        "-" if link.coverage is None else f"{100.0 * link.coverage:.1f} %",
-        millimetres(link.protrusion),
-        millimetres(link.mean_protrusion),
-    )
+    lengths = (text(value, 1000.0, "mm") for value in (link.protrusion, link.mean_protrusion))
+    coverage = text(link.coverage, 100.0, "%")
+    return link.link, str(link.spheres), link.source, verdict, coverage, *lengths
 
 
 def robot_report(robot: Any) -> RobotReport:
@@ -153,9 +145,7 @@ def robot_report(robot: Any) -> RobotReport:
     )
 
 
-def _of_link(
-    robot: Any, name: str
-) -> tuple[tuple[PrimitiveGeometry, ...], tuple[MeshFile, ...], np.ndarray]:
+def _of_link(robot: Any, name: str) -> tuple[tuple, tuple, np.ndarray]:
     """Its solids, its meshes and its spheres, as they were read."""
     solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
     return solids, meshes, robot.link_spheres.get(name, np.empty((0, 4)))
@@ -202,8 +192,7 @@ def _link_report(robot: Any, name: str) -> LinkReport:
         return replace(stated, enclosed=False, coverage=0.0)
     if missing or not (solids or meshes):
         return stated
-    held = [solid for solid in solids if solid.kind == "sphere" and _in_one(solid, rows)]
-    rest = [solid for solid in solids if solid not in held]
+    rest = [solid for solid in solids if solid.kind != "sphere" or not _in_one(solid, rows)]
     surface = link_triangles(rest, meshes, _SIDES)
     gap = sphere_gap(surface_samples(surface), rows)
     worst, mean = protrusion(solids, link_triangles((), meshes) if meshes else None, rows)
@@ -268,11 +257,15 @@ def protrusion(
     """How far the union of spheres stands out of a link at most, and on average, metres.
 
     Measured at 200 points of each sphere that lie in no other: their distance to the link, 0
-    inside it (an open shell is solid up to its convex hull). To a mesh the distance is taken
-    to points of it so dense that it is too large by half a millimetre at most where it is two
-    centimetres or more.
+    inside it (an open shell is solid up to its convex hull). To a mesh it is taken to points,
+    and too large by half a millimetre at most from two centimetres on.
     """
-    points = _outer_points(spheres)
+    i = np.arange(_ON_SPHERE) + 0.5
+    height, turn = 1.0 - 2.0 * i / _ON_SPHERE, math.pi * (1.0 + math.sqrt(5.0)) * i
+    rim = np.sqrt(1.0 - height**2)
+    unit = np.stack([rim * np.cos(turn), rim * np.sin(turn), height], axis=1)
+    points = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
+    points = points[sphere_gap(points, spheres) > -1e-9]
     if len(points) == 0:
         return 0.0, 0.0
     away = np.full(len(points), math.inf)
@@ -282,16 +275,6 @@ def protrusion(
         away = np.minimum(away, _mesh_distance(triangles, points))
     away = np.maximum(away, 0.0)
     return float(away.max()), float(away.mean())
-
-
-def _outer_points(spheres: Spheres) -> Points:
-    """Points of the union's surface."""
-    i = np.arange(_ON_SPHERE) + 0.5
-    height, turn = 1.0 - 2.0 * i / _ON_SPHERE, math.pi * (1.0 + math.sqrt(5.0)) * i
-    rim = np.sqrt(1.0 - height**2)
-    unit = np.stack([rim * np.cos(turn), rim * np.sin(turn), height], axis=1)
-    points = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
-    return points[sphere_gap(points, spheres) > -1e-9]
 
 
 def _mesh_distance(triangles: Triangles, points: Points) -> Values:

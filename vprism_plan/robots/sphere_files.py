@@ -6,7 +6,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,52 +51,37 @@ def link_spheres(
     spheres: str | Path | Mapping[str, Any] | None,
     fit: SphereFit,
 ) -> ChosenSpheres:
-    """Choose and validate the collision spheres of a robot.
-
-    The arguments are those of :meth:`Robot.from_urdf`.
-
-    Raises:
-        RobotError: A sphere is malformed, of an unknown link, or missing where geometry is.
-    """
+    """Choose and validate the collision spheres of a robot, see :meth:`Robot.from_urdf`."""
+    has = f"the robot has the links {list(model.links)}"
     named = set(fit.max_spheres) if isinstance(fit.max_spheres, Mapping) else set()
     if named - model.links.keys():
-        raise RobotError(
-            f"max_spheres names the links {sorted(named - model.links.keys())}, which the robot "
-            f"does not have; links: {list(model.links)}"
-        )
+        raise RobotError(f"max_spheres names the links {sorted(named - model.links.keys())}; {has}")
     if spheres is None:
         beside = urdf_path.with_name(f"{urdf_path.stem}_spheres.yml")
         spheres = beside if beside.is_file() else FIT
     if isinstance(spheres, str) and spheres == FIT:
-        chosen = _from_geometry(model, tuple(model.links), fit)
+        chosen = _from_geometry(model, model.links, fit)
         if not chosen.rows:
-            raise RobotError(
-                f"'{urdf_path}': no link has collision geometry; add <collision> elements, or pass "
-                "spheres={link: [{center, radius}]}"
-            )
+            remedy = "add <collision> elements, or pass spheres={link: [{center, radius}]}"
+            raise RobotError(f"'{urdf_path}': no link has collision geometry; {remedy}")
         return chosen
     table = read_spheres(spheres)
     known = {name: rows for name, rows in table.spheres.items() if name in model.links}
     for link, rows in table.spheres.items():
         if link not in model.links and (len(rows) or not table.foreign):
-            raise RobotError(
-                f"{table.source} gives spheres for the unknown link '{link}'; "
-                f"links: {list(model.links)}"
-            )
-    bare = tuple(name for name in model.links if name not in known and _has_geometry(model, name))
+            raise RobotError(f"{table.source} gives spheres for the unknown link '{link}'; {has}")
+    solid = [name for name, link in model.links.items() if link.primitives or link.meshes]
+    bare = [name for name in solid if name not in known]
     if bare and not table.foreign:
         raise RobotError(
-            f"{table.source} gives no spheres for the links {list(bare)}, which have collision "
+            f"{table.source} gives no spheres for the links {bare}, which have collision "
             "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
             "on purpose"
         )
-    emptied = [name for name, rows in known.items() if not len(rows) and _has_geometry(model, name)]
+    emptied = [name for name, rows in known.items() if not len(rows) and name in solid]
     if emptied and table.foreign:
-        _logger.warning(
-            "%s leaves the links %s without spheres; they have collision geometry and are not "
-            "checked",
-            *(table.source, emptied),
-        )
+        odd = "%s leaves the links %s without spheres; they have geometry that is not checked"
+        _logger.warning(odd, table.source, emptied)
     rest = _from_geometry(model, bare, fit)
     if rest.rows:
         _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
@@ -107,11 +92,7 @@ def link_spheres(
     return ChosenSpheres(held, {name: sources[name] for name in held}, table.padding)
 
 
-def _has_geometry(model: RobotModel, name: str) -> bool:
-    return bool(model.links[name].primitives or model.links[name].meshes)
-
-
-def _from_geometry(model: RobotModel, links: tuple[str, ...], fit: SphereFit) -> ChosenSpheres:
+def _from_geometry(model: RobotModel, links: Iterable[str], fit: SphereFit) -> ChosenSpheres:
     """Spheres that hold the collision geometry of the URDF."""
     rows: LinkSpheres = {}
     sources: dict[str, str] = {}
@@ -188,7 +169,7 @@ def _understood(content: Any, source: str, folder: Path) -> SphereTable:
     alone = isinstance(content, Mapping) and "robot" in content
     spheres_of = _table(content, source, off=alone)
     padding: dict[str, float] = {}
-    if isinstance(content, Mapping) and "collision_spheres" in content and not alone:
+    if "collision_spheres" in content and not alone:
         own = content.get("padding")
         unknown = sorted(set(own) - set(spheres_of)) if isinstance(own, Mapping) else []
         if unknown:
@@ -208,11 +189,7 @@ def _yaml(path: Path) -> Any:
 
 @functools.cache
 def _loader() -> Any:
-    """YAML's safe loader, with two rules more.
-
-    It would keep only the last of several lists for one link, and a few aliases of aliases
-    stand for more values than any memory holds.
-    """
+    """YAML's safe loader, without a second list for a link, or aliases that no memory holds."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -242,15 +219,14 @@ def _loader() -> Any:
             node = super().compose_mapping_node(anchor)
             seen = set()
             for key, _ in node.value:
+                problem = None
                 if not isinstance(key, yaml.ScalarNode):
-                    raise yaml.constructor.ConstructorError(
-                        problem="a key is no plain name", problem_mark=key.start_mark
-                    )
-                if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        problem=f"the key '{key.value}' occurs twice; join the two",
-                        problem_mark=key.start_mark,
-                    )
+                    problem = "a key is no plain name"
+                elif key.value in seen:
+                    problem = f"the key '{key.value}' occurs twice; join the two"
+                if problem is not None:
+                    mark = key.start_mark
+                    raise yaml.constructor.ConstructorError(problem=problem, problem_mark=mark)
                 seen.add(key.value)
             return node
 
@@ -284,10 +260,8 @@ def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
         name = next(iter(geometries))
     chosen = geometries.get(name)
     if not isinstance(chosen, Mapping) or "spheres" not in chosen:
-        raise RobotError(
-            f"{source}: the section 'collision' names the geometry {name!r}, which has no spheres; "
-            f"geometries: {sorted(map(str, geometries))}"
-        )
+        found = f"the section 'collision' names the geometry {name!r}, which has no spheres"
+        raise RobotError(f"{source}: {found}; geometries: {sorted(map(str, geometries))}")
     spheres = _table(chosen["spheres"], source, off=True)
     padding = _padding(section.get("buffer_distance"), spheres, source)
     return SphereTable(source, spheres, padding, foreign=True)
@@ -298,15 +272,14 @@ def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]
     padding = {}
     for link, value in table.items():
         try:
-            number = float(value)
+            grown = float(value)
         except (TypeError, ValueError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise RobotError(
-                f"{source}: the buffer of link '{link}' is {value!r}; it must be metres"
-            )
-        if number > 0.0 and len(spheres.get(link, ())):
-            padding[str(link)] = number
+            grown = math.nan
+        if not math.isfinite(grown):
+            found = f"the buffer of link '{link}' is {value!r}"
+            raise RobotError(f"{source}: {found}; it must be metres")
+        if grown > 0.0 and len(spheres.get(link, ())):
+            padding[str(link)] = grown
     return padding
 
 
@@ -319,25 +292,21 @@ def _table(content: Any, source: str, off: bool) -> LinkSpheres:
 
 
 def _rows(link: str, entries: Any, source: str, off: bool) -> Spheres:
-    if entries is None:
-        entries = []
+    entries = [] if entries is None else entries
     if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
         raise RobotError(f"{source}: the spheres of '{link}' are {entries!r}; expected a list")
     rows = np.empty((len(entries), 4))
     for row, entry in zip(rows, entries, strict=True):
+        found = f"{source}: a sphere of '{link}' is {entry!r}"
         try:
             x, y, z = entry["center"]
             row[:] = float(x), float(y), float(z), float(entry["radius"])
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise RobotError(
-                f"{source}: a sphere of '{link}' is {entry!r}; expected "
-                "{center: [x, y, z], radius: r} in metres"
-            ) from error
+            wanted = "expected {center: [x, y, z], radius: r} in metres"
+            raise RobotError(f"{found}; {wanted}") from error
         if not np.isfinite(row).all() or (row[3] <= 0 and not off):
-            raise RobotError(
-                f"{source}: a sphere of '{link}' is {entry!r}; centre and radius must be finite "
-                "and the radius positive"
-            )
+            wanted = "centre and radius must be finite and the radius positive"
+            raise RobotError(f"{found}; {wanted}")
     return rows[rows[:, 3] > 0.0]
 
 
@@ -353,8 +322,7 @@ def write_spheres(
         path: The file.
         spheres: Link -> (n, 4) rows (x, y, z, radius), link frame, metres.
         note: Lines for a comment at the top.
-        padding: Link -> metres that a robot's spheres grow by against the world, not
-            contained in their radii.
+        padding: Link -> metres that spheres grow by against the world, not in their radii.
     """
     lines = [f"# {line}".rstrip() for line in note.splitlines()]
     lines.append("collision_spheres:")

@@ -122,9 +122,9 @@ def _states(
             except ValueError:
                 values[name] = math.nan
             if not math.isfinite(values[name]):
+                found = f"gives joint '{name}' the value {joint.get('value')!r}"
                 raise RobotError(
-                    f"state '{state.get('name')}' in '{path}' gives joint '{name}' the value "
-                    f"{joint.get('value')!r}; one finite number is supported"
+                    f"state '{state.get('name')}' in '{path}' {found}; give one finite number"
                 )
         states[state.get("name", ""), state.get("group", "")] = values
     return states
@@ -133,19 +133,16 @@ def _states(
 def _disabled(root: ET.Element, model: RobotModel, path: Path) -> dict[frozenset[str], str]:
     pairs: dict[frozenset[str], str] = {}
     for element in root.findall("disable_collisions"):
-        names = [
-            _known(element.get(key, ""), model.links, "link", path) for key in ("link1", "link2")
-        ]
-        pairs[frozenset(names)] = element.get("reason", "")
+        ends = (element.get(key, "") for key in ("link1", "link2"))
+        pair = frozenset(_known(end, model.links, "link", path) for end in ends)
+        pairs[pair] = element.get("reason", "")
     return pairs
 
 
-def _known(name: str, valid: object, what: str, path: Path) -> str:
-    if name not in valid:  # type: ignore[operator]
-        raise RobotError(
-            f"'{path}' names the {what} '{name}', which the robot does not have; "
-            f"valid: {sorted(valid)}"  # type: ignore[call-overload]
-        )
+def _known(name: str, valid: Mapping[str, Any], what: str, path: Path) -> str:
+    if name not in valid:
+        found = f"'{path}' names the {what} '{name}', which the robot does not have"
+        raise RobotError(f"{found}; valid: {sorted(valid)}")
     return name
 
 
@@ -162,10 +159,8 @@ def choose_joints(
             raise RobotError(f"both joints and the group {group!r} are given; give one of them")
         joints = [name for name in semantics.groups.get(group, ()) if name in valid]
         if not joints:
-            raise RobotError(
-                f"the SRDF of '{model.name}' has no group {group!r} with joints that move; "
-                f"groups: {sorted(semantics.groups)}"
-            )
+            found = f"the SRDF of '{model.name}' has no group {group!r} with joints that move"
+            raise RobotError(f"{found}; groups: {sorted(semantics.groups)}")
     if joints is None:
         arm = [name for name in semantics.groups.get("arm", ()) if name in valid]
         chosen = tuple(arm) or valid
@@ -203,10 +198,8 @@ def lock_values(
             value = min(max(0.0, joint.lower), joint.upper)
         within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
         if not (math.isfinite(value) and within):
-            raise RobotError(
-                f"joint '{name}' is locked at {value}; its limits are "
-                f"[{joint.lower:.6g}, {joint.upper:.6g}]"
-            )
+            limits = f"[{joint.lower:.6g}, {joint.upper:.6g}]"
+            raise RobotError(f"joint '{name}' is locked at {value}; its limits are {limits}")
         values[name] = value
     return values
 
