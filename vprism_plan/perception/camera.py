@@ -68,14 +68,10 @@ def invert_transform(transform: Pose) -> Pose:
 def within_balls(points: Points, balls: Float[np.ndarray, "s 4"]) -> Chosen:
     """Whether each point lies in a ball, its surface included.
 
-    A point is in a ball of radius r about c if |x - c|^2 + (R^2 - r^2) <= R^2: a nearest
-    neighbour search in four dimensions, with the root of R^2 - r^2 as the fourth, answers that
-    for all balls with radii up to R at once. Balls are taken by size, down to half of R
-    together, so that the fourth coordinate does not outweigh the others.
-
-    Args:
-        points: metres; what is not finite is in no ball.
-        balls: rows (x, y, z, radius), metres; a radius below 0 holds nothing.
+    What is not finite is in no ball, and a radius below 0 holds nothing. A point is in a ball of
+    radius r about c if |x - c|^2 + (R^2 - r^2) <= R^2: a nearest neighbour search in four
+    dimensions, with the root of R^2 - r^2 as the fourth, answers that for all balls with radii
+    up to R at once; down to half of R, so that the fourth does not outweigh the others.
     """
     from scipy.spatial import cKDTree
 

@@ -40,8 +40,8 @@ class SurfaceImage:
     ) -> Iterator[tuple[Slices, Slices, np.ndarray, np.ndarray]]:
         """Yield, for each of four directions, pixel pairs `reach` pixels apart.
 
-        Each item is (slices of the first pixel, slices of the second, both have a
-        return, step): step is -1, 0 or 1 for a jump towards the camera, none, or away.
+        That is slices of the first and second pixel, whether both have a return, and -1, 0 or 1
+        for a jump towards the camera, none, or away.
         """
         rows, cols = self.depth.shape
         for unit_row, unit_col in _HALF:
@@ -113,10 +113,7 @@ def flying_pixels(image: SurfaceImage) -> Pixels:
 
 
 def jump_pixels(image: SurfaceImage, reach: int = 2) -> Pixels:
-    """Find the pixels within `reach` of a jump in depth: edges, and all but the mildest ramps.
-
-    Cutting the graph here separates objects that the sensor's smoothing glues together.
-    """
+    """Find the pixels within `reach` of a jump in depth: edges, and all but the mildest ramps."""
     jumps = np.zeros(image.depth.shape, dtype=bool)
     for here, there, _, step in image.pairs(reach, _CUT_SLANT):
         jumps[here] |= step != 0

@@ -62,10 +62,7 @@ def mend(views: Sequence[Observation], plane: Plane, first: int = 0) -> tuple[Ob
       the depth, which is not the object's.
     - An object that lacks a return on most of its pixels is named.
 
-    Args:
-        views: labelled.
-        plane: support surface, world frame.
-        first: number of views that came before, for the wording.
+    The plane is in the world frame; `first` views came before, for the wording.
     """
     return _each(views, first, lambda view: _mended(view, plane))
 
@@ -315,9 +312,9 @@ _GAP = 2  # pixels without a return that may lie between a fringe and its object
 _STEEP = float(np.tan(np.radians(75.0)))  # neighbours on one surface, as in the segmentation
 _NOISE = 2.0  # standard deviations
 _STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
-# Sensors blur edges, so right masks have fringes here and there: up to 17 % of the lines on
-# generated scenes; on real ones half the lines and 14 % of the edge of small objects, but none
-# on the table. A mask one pixel too wide has 60 %, and one shifted by a pixel 40 %.
+# Right masks have fringes as well: up to 17 % of the lines on generated scenes; on real ones half
+# the lines and 14 % of the edge of small objects, but none on the table. A mask one pixel too
+# wide has 60 %, and one shifted by a pixel 40 %.
 _FEWEST_LINES, _ON_TABLE, _LINES, _EDGE = 10, 0.25, 0.35, 0.18
 
 

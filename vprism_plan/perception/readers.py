@@ -104,18 +104,14 @@ def _load_npz(path: Path) -> Observation:
         members = [m for m in archive.zip.infolist() if m.filename[:-4] in _NPZ_KEYS]
         unpacked = sum(member.file_size for member in members)
         if unpacked > _MOST_UNPACKED:
-            raise ObservationError(
-                f"{path} unpacks to {unpacked:,} bytes; an observation has at most "
-                f"{_MOST_UNPACKED:,}"
-            )
+            most = f"an observation has at most {_MOST_UNPACKED:,}"
+            raise ObservationError(f"{path} unpacks to {unpacked:,} bytes; {most}")
         content = {key: archive[key] for key in _NPZ_KEYS if key in archive.files}
         found = ", ".join(archive.files) or "nothing"
     for key in ("depth", "intrinsics"):
         if key not in content:
-            raise ObservationError(
-                f"has no {key!r} (found: {found}); an observation needs depth (metres) and "
-                "intrinsics (3x3)"
-            )
+            wanted = "an observation needs depth (metres) and intrinsics (3x3)"
+            raise ObservationError(f"has no {key!r} (found: {found}); {wanted}")
     content["plane"] = _plane(content.get("plane"), "plane")
     content["max_range"] = float(
         _matrix(content.get("max_range", DEFAULT_MAX_RANGE), (), "max_range")
@@ -128,12 +124,11 @@ def _load_images(depth: Path, prefix: str) -> Observation:
     content, raw = _files.read_json(camera, ObservationError), _read_depth(depth)
     for key, size in (("width", raw.shape[1]), ("height", raw.shape[0])):
         if key in content and content[key] != size:
-            raise ObservationError(
-                f"{camera}: {key!r} is {content[key]} but {depth.name} is {raw.shape[1]}x"
-                f"{raw.shape[0]}; scale the intrinsics to the image's resolution"
-            )
+            found = f"{key!r} is {content[key]} but {depth.name} is {raw.shape[1]}x{raw.shape[0]}"
+            remedy = "scale the intrinsics to the image's resolution"
+            raise ObservationError(f"{camera}: {found}; {remedy}")
     fx, fy, cx, cy = (_number(content, key, camera) for key in ("fx", "fy", "cx", "cy"))
-    scale = _number(content, "depth_scale", camera, low=0.0)
+    scale = _number(content, "depth_scale", camera)
     pose = content.get("T_world_camera")
     if pose is not None:
         pose = _matrix(pose, (4, 4), f"{camera}: 'T_world_camera'")
@@ -146,7 +141,7 @@ def _load_images(depth: Path, prefix: str) -> Observation:
         "color": _read_color(color) if color.is_file() else None,
         "plane": _plane(content.get("plane"), f"{camera}: 'plane'"),
         "robot_spheres": content.get("robot_spheres"),
-        "max_range": _number(content, "max_range", camera, DEFAULT_MAX_RANGE, 0.0),
+        "max_range": _number(content, "max_range", camera, DEFAULT_MAX_RANGE),
     }
     return _straight(given, _read_distortion(content, camera))
 
@@ -180,7 +175,7 @@ def _load_bop(scene: Path, frame: int | None) -> Observation:
     raw, color = _read_depth(depth), _existing(scene / "rgb" / stem, ".png", ".jpg")
     what = f"{path}: image {key}"
     given = {
-        "depth": raw * (_number(camera, "depth_scale", path, 1.0, 0.0) * _MILLIMETRE),
+        "depth": raw * (_number(camera, "depth_scale", path, 1.0) * _MILLIMETRE),
         "labels": _bop_labels(scene / "mask_visib", stem, raw.shape),
         "intrinsics": _matrix(camera["cam_K"], (3, 3), f"{what} 'cam_K'"),
         "T_world_camera": _bop_pose(camera, what),
@@ -277,10 +272,8 @@ def _read_image(path: Path, modes: tuple[str, ...], wanted: str) -> tuple[np.nda
         Image.open(path, formats=_IMAGE_FORMATS) as image,
     ):
         if image.width * image.height > _MOST_PIXELS:
-            raise ObservationError(
-                f"{path} is an image of {image.width} x {image.height} pixels; at most "
-                f"{_MOST_PIXELS:,} are read"
-            )
+            size = f"{image.width} x {image.height} pixels; at most {_MOST_PIXELS:,} are read"
+            raise ObservationError(f"{path} is an image of {size}")
         pixels, mode = np.array(image), image.mode
     if mode not in modes:
         raise ObservationError(f"{path} has pixel format {mode}; {wanted}")
@@ -289,12 +282,9 @@ def _read_image(path: Path, modes: tuple[str, ...], wanted: str) -> tuple[np.nda
 
 def _read_depth(path: Path) -> np.ndarray:
     """Return raw sensor units (H, W) of a 16-bit image, 0 = no return, also for "no data"."""
-    raw, _ = _read_image(
-        path,
-        _DEPTH_MODES,
-        "depth must be a 16-bit single-channel PNG (an 8-bit image has lost the metric depth: "
-        "export the raw one)",
-    )
+    remedy = "an 8-bit image has lost the metric depth: export the raw one"
+    wanted = f"depth must be a 16-bit single-channel PNG ({remedy})"
+    raw, _ = _read_image(path, _DEPTH_MODES, wanted)
     # 16 bits may arrive in a wider type.
     largest = _UINT16_MAX if raw.max() == _UINT16_MAX else np.iinfo(raw.dtype).max
     return np.where(raw == largest, 0, raw).astype(raw.dtype)
@@ -312,14 +302,9 @@ def _read_color(path: Path) -> np.ndarray:
     return np.repeat(raw[..., None], 3, 2) if mode == "L" else np.ascontiguousarray(raw[..., :3])
 
 
-def _number(
-    content: dict[str, Any],
-    key: str,
-    path: Path,
-    default: float | None = None,
-    low: float = -np.inf,
-) -> float:
-    """Return a finite number above `low` from a JSON object, or name what is missing."""
+def _number(content: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
+    """Return a finite number from a JSON object, or name what is missing."""
+    low = 0.0 if key in ("depth_scale", "max_range") else -np.inf
     if key in content:
         value = content[key]
         return number(f"{path}: {key!r}", value, low, above=True, error=ObservationError)
@@ -335,9 +320,8 @@ def _matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError) as error:
         raise ObservationError(f"{what} is not a matrix of numbers: {error}") from error
     if array.size != int(np.prod(shape)):
-        raise ObservationError(
-            f"{what} has {array.size} numbers; it must have {int(np.prod(shape))} ({shape})"
-        )
+        wanted = f"it must have {int(np.prod(shape))} ({shape})"
+        raise ObservationError(f"{what} has {array.size} numbers; {wanted}")
     return array.reshape(shape)
 
 

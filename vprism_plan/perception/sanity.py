@@ -57,10 +57,9 @@ def _pose(view: Observation, plane: Plane) -> list[str]:
     """Name a table that is not level; refuse what can be none."""
     height = float(plane.signed_distance(view.camera_center))
     if height > _HIGHEST:
-        raise ObservationError(
-            f"the camera is {height:.1f} m above the support surface, more than {_HIGHEST:g} m; "
-            "give depth and T_world_camera in metres: is one of them in millimetres, or scaled?"
-        )
+        remedy = "give depth and T_world_camera in metres: is one in millimetres, or scaled?"
+        where = f"the camera is {height:.1f} m above the support surface"
+        raise ObservationError(f"{where}, more than {_HIGHEST:g} m; {remedy}")
     if not view.posed:
         return []
     tilt = _angle(plane.normal)

@@ -72,22 +72,18 @@ def segment_tabletop(
     background, and so remains an obstacle: clutter too small, too large (`max_size`,
     `max_height`: walls, people) or not over the table top.
 
-    Flying pixels, which stereo sensors invent between the two sides of a depth edge, and
-    specks of at most 12 pixels and 1 cm^2 that no surface continues are set to depth 0, "no
-    return": they would be obstacles in mid-air and cast shadows. This is done only over the
-    table top (10 cm around it, up to 1 m above it). Ramps of more than three pixels stay, as
-    obstacles: they may be the side of a box seen at a glancing angle.
-
     Args:
         obs: observation; existing labels are replaced.
         plane: support plane in the world frame; default: `obs.plane`, else `fit_plane`.
         seed: seed of the plane fit.
-        min_height: least height over the plane, metres.
-        max_height: largest height of an object, metres.
+        min_height, max_height: of an object over the plane, metres.
         max_size: largest horizontal size of an object, metres.
         min_area: least visible area of an object, square metres, measured facing the camera.
         min_points: least number of pixels of an object.
-        remove_flying: set flying pixels and specks to "no return".
+        remove_flying: set depth to 0, "no return", where stereo sensors invent it between the
+            two sides of a depth edge, and at specks of at most 12 pixels and 1 cm^2: they would
+            be obstacles in mid-air. Only over the table top (10 cm around it, up to 1 m above),
+            and not in ramps of more than three pixels, which may be the side of a box.
 
     Returns:
         The observation with `labels` and `plane` set. If nothing stands on the plane all
@@ -215,9 +211,7 @@ def _join_fragments(
     candidates = np.flatnonzero(area > _MIN_FRAGMENT)
     order = candidates[np.argsort(-area[candidates], kind="stable")].tolist()
     members = {c: points[clusters == c] for c in order}
-    reach = {
-        c: _REACH + 3.0 * float(np.median(stereo_noise(image.depth[clusters == c]))) for c in order
-    }
+    noise = {c: float(np.median(stereo_noise(image.depth[clusters == c]))) for c in order}
     axes = plane.axes()
     owner = np.arange(len(area))
     for position, big in enumerate(order):
@@ -232,7 +226,7 @@ def _join_fragments(
                 inside = (flat @ outline[:, :2].T + outline[:, 2] <= 0.0).all(axis=1)
                 joined = bool(inside.mean() >= _INSIDE)
             if not joined and area[small] <= _FRAGMENT * area[big]:
-                joined = _touch(members[big], members[small], reach[small])
+                joined = _touch(members[big], members[small], _REACH + 3.0 * noise[small])
             if joined:
                 owner[small] = big
     return np.asarray(np.unique(owner[clusters], return_inverse=True)[1]).reshape(clusters.shape)
@@ -250,7 +244,7 @@ def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
     return bool(np.isfinite(gap).mean() >= _CONTACT)
 
 
-def _footprint(flat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "f 3"] | None:
+def _footprint(flat: np.ndarray) -> np.ndarray | None:
     """Half-planes of the convex hull of a footprint, or None if it has no area."""
     from scipy.spatial import ConvexHull, QhullError
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from vprism_plan._arguments import number, rigid_pose, whole
 from vprism_plan._shapes import Pairs, Points, Spheres, Triangles, Values, Vector
@@ -19,7 +18,6 @@ from vprism_plan.robots.geometry import read_triangles
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,
-    TorchKinematics,
     bounding_ball,
     in_frame,
     only_links,
@@ -64,7 +62,6 @@ def padded(
         disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if p not in again},
         geometry=geometry,
         meshes=meshes,
-        _torch=TorchKinematics(arrays),
     )
 
 
@@ -74,9 +71,7 @@ def _with_pairs(arrays: KinematicArrays, added: Sequence[Sequence[int]]) -> Pair
     return np.ascontiguousarray(both[np.lexsort((both[:, 1], both[:, 0]))])
 
 
-def _per_link(
-    robot: Any, value: float | Mapping[str, float], default: float, what: str
-) -> Float[np.ndarray, "links"]:
+def _per_link(robot: Any, value: Any, default: float, what: str) -> Values:
     """One number per link, from one for all or from a table of links and groups."""
     names = robot.link_names
     if not isinstance(value, Mapping):
@@ -95,9 +90,7 @@ def _allowed(value: Any, what: str, whose: str) -> float:
     return number(f"{what} of {whose}", value, 0.0, above=above, error=RobotError)
 
 
-def grown(
-    arrays: KinematicArrays, scale: Float[np.ndarray, "links"], padding: Float[np.ndarray, "links"]
-) -> KinematicArrays:
+def grown(arrays: KinematicArrays, scale: Values, padding: Values) -> KinematicArrays:
     """Scale the spheres of each link about the centre of its bounding ball, then pad them.
 
     What was padding is scaled like the rest and stays padding, up to its old size.
@@ -109,9 +102,8 @@ def grown(
     for link, (factor, pad) in enumerate(zip(scale, padding, strict=True)):
         rows = slice(int(arrays.link_start[link]), int(arrays.link_start[link + 1]))
         if factor != 1.0:
-            centers[rows], radii[rows] = _scaled(
-                centers[rows], radii[rows], arrays.link_center[link], float(factor)
-            )
+            about = arrays.link_center[link]
+            centers[rows], radii[rows] = _scaled(centers[rows], radii[rows], about, float(factor))
         radii[rows] += pad
         order = np.argsort(-radii[rows], kind="stable")
         centers[rows], radii[rows] = centers[rows][order], radii[rows][order]
@@ -120,8 +112,8 @@ def grown(
         arrays,
         sphere_center=np.ascontiguousarray(centers),
         sphere_radius=radii,
-        link_center=np.array([ball[0] for ball in balls]),
-        link_radius=np.array([ball[1] for ball in balls]),
+        link_center=np.array([center for center, _ in balls]),
+        link_radius=np.array([radius for _, radius in balls]),
         link_padding=np.minimum(scale, 1.0) * arrays.link_padding + padding,
     )
 
@@ -197,7 +189,6 @@ def attached(
         attached=robot.attached | {name: link},
         held=robot.held | {name: held},
         _links=robot._links | {name: sits},
-        _torch=TorchKinematics(arrays),
     )
 
 
@@ -223,7 +214,6 @@ def detached(robot: Any, name: str) -> Any:
         attached={other: link for other, link in robot.attached.items() if other != name},
         held={other: shape for other, shape in robot.held.items() if other != name},
         _links={link: sits for link, sits in robot._links.items() if link != name},
-        _torch=TorchKinematics(arrays),
     )
 
 

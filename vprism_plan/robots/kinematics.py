@@ -39,30 +39,26 @@ class KinematicArrays:
     with ``T_0 = [base_R, base_t]``. Metres and radians.
 
     Attributes:
-        base_R: Rotation of the base in the world.
-        base_t: Position of the base in the world.
+        base_R, base_t: Rotation and position of the base in the world.
         parent: Parent frame, -1 for frame 0.
-        R_off: Joint frame in its parent frame at joint value 0, rotation.
-        t_off: The same, translation.
+        R_off, t_off: Joint frame in its parent frame at joint value 0.
         axis: Unit joint axis in the joint frame.
         kind: 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic.
         q_index: Index into the configuration, -1 for frame 0.
-        q_mult: Factor on the configuration value (1 unless the joint mimics).
-        q_offset: Offset added to it (0 unless the joint mimics).
+        q_mult, q_offset: Factor on the configuration value and what is added to it (1 and 0
+            unless the joint mimics).
         sphere_frame: Frame each sphere moves with.
         sphere_center: Centre in that frame.
         sphere_radius: Radius. Spheres are sorted by link, and in it by falling radius.
         sphere_link: Index into the robot's ``link_names``.
         link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
         link_frame: Frame each link moves with.
-        link_center: Centre of a ball that holds all spheres of the link.
-        link_radius: Radius of that ball.
+        link_center, link_radius: A ball that holds all spheres of the link.
         link_fixed: True where no joint moves the link.
         link_padding: Metres of each link's radii that are padding. They count against the
             world; a pair's gap is that of its spheres plus the padding of both links.
         pairs: Link pairs (first < second) to test for self-collision.
-        lower: Lower joint limits; -pi for continuous joints.
-        upper: Upper joint limits; +pi for continuous joints.
+        lower, upper: Joint limits; -pi and pi for continuous joints.
         continuous: True where the joint turns without limit.
     """
 
@@ -153,6 +149,11 @@ def build_arrays(
                 motion[:3, :3] = rotation(joint.axis, value)
             links[joint.child] = Attachment(parent.frame, T @ motion)
     chosen = [model.joint_map[name] for name in active]
+    centers, radii, ball_centers, ball_radii = zip(
+        *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
+    )
+    counts = [len(rows) for rows in radii]
+    link_frame = np.array([links[name].frame for name in spheres])
     parents, offsets, axes, kinds, drivers, factors, shifts = (
         np.array(column) for column in zip(*frames, strict=True)
     )
@@ -167,7 +168,16 @@ def build_arrays(
         q_index=drivers,
         q_mult=factors,
         q_offset=shifts,
-        **_sphere_arrays(spheres, links),
+        sphere_frame=np.repeat(link_frame, counts),
+        sphere_center=np.vstack(centers),
+        sphere_radius=np.concatenate(radii),
+        sphere_link=np.repeat(np.arange(len(counts)), counts),
+        link_start=np.array([0, *np.cumsum(counts)]),
+        link_frame=link_frame,
+        link_center=np.array(ball_centers),
+        link_radius=np.array(ball_radii),
+        link_fixed=link_frame == 0,
+        link_padding=np.zeros(len(link_frame)),
         pairs=np.empty((0, 2), dtype=np.int64),
         lower=np.array([joint.lower for joint in chosen]),
         upper=np.array([joint.upper for joint in chosen]),
@@ -181,26 +191,6 @@ def in_frame(sits: Attachment, rows: Spheres) -> tuple[Points, Values, Vector, f
     rows = rows[np.argsort(-rows[:, 3], kind="stable")]
     local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
     return local, rows[:, 3], *bounding_ball(local, rows[:, 3])
-
-
-def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dict[str, np.ndarray]:
-    centers, radii, ball_centers, ball_radii = zip(
-        *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
-    )
-    counts = [len(rows) for rows in radii]
-    link_frame = np.array([links[name].frame for name in spheres])
-    return {
-        "sphere_frame": np.repeat(link_frame, counts),
-        "sphere_center": np.vstack(centers),
-        "sphere_radius": np.concatenate(radii),
-        "sphere_link": np.repeat(np.arange(len(counts)), counts),
-        "link_start": np.array([0, *np.cumsum(counts)]),
-        "link_frame": link_frame,
-        "link_center": np.array(ball_centers),
-        "link_radius": np.array(ball_radii),
-        "link_fixed": link_frame == 0,
-        "link_padding": np.zeros(len(link_frame)),
-    }
 
 
 def bounding_ball(centers: Points, radii: Values) -> tuple[Vector, float]:

@@ -88,9 +88,7 @@ class RobotReport:
 
     @property
     def enclosed(self) -> bool | None:
-        """Whether all links are proved to be enclosed; None where a link's mesh is missing, and
-        where no link has geometry to compare with.
-        """
+        """Whether all links are proved to be enclosed; None where no link or mesh is known."""
         known = [link.enclosed for link in self.links if link.geometry]
         return False if False in known else True if known and None not in known else None
 
@@ -211,19 +209,15 @@ def _in_one(solid: PrimitiveGeometry, rows: np.ndarray) -> bool:
     return bool((away + solid.size[0] <= rows[:, 3] * (1.0 + 1e-12)).any())
 
 
-# Where a triangle's edges are shorter than this and it still is in no single sphere, the
-# surface counts as bare, metres.
-_FINEST = 2e-6
-_ON_SPHERE = 200
-_ROWS = 20_000
+_FINEST = 2e-6  # metres: a triangle with shorter edges that is in no single sphere is bare
+_ON_SPHERE, _ROWS = 200, 20_000
 
 
 def enclosed(triangles: Triangles, spheres: Spheres) -> bool:
     """Whether every point of a surface lies in the union of spheres: a proof, no sampling.
 
     A triangle whose corners lie in one sphere lies in it. Others are halved, until all do
-    (proved) or a corner lies in none (refuted). A surface that touches the union's edge from
-    inside, to within a few thousandths of a millimetre, counts as bare.
+    (proved) or a corner lies in none (refuted), or nearly so.
     """
     waiting = [triangles[i : i + _ROWS] for i in range(0, len(triangles), _ROWS)]
     while waiting:

@@ -89,7 +89,6 @@ class Robot:
     disabled_pairs: dict[frozenset[str], str]
     arrays: KinematicArrays
     _links: dict[str, Attachment] = field(repr=False)
-    _torch: TorchKinematics = field(repr=False)
     meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     link_spheres: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     sphere_sources: dict[str, str] = field(default_factory=dict, repr=False)
@@ -187,7 +186,6 @@ class Robot:
             disabled_pairs=disabled,
             arrays=arrays,
             _links=links,
-            _torch=TorchKinematics(arrays),
             meshes=meshes,
             link_spheres=chosen.rows,
             sphere_sources=chosen.sources,
@@ -249,6 +247,10 @@ class Robot:
         if READY in self.named_states:
             return self.named_states[READY].copy()
         return np.clip(np.zeros(self.dof), self.lower, self.upper)
+
+    @functools.cached_property
+    def _torch(self) -> TorchKinematics:
+        return TorchKinematics(self.arrays)
 
     @functools.cached_property
     def reach(self) -> float:

@@ -2,10 +2,9 @@
 """Spheres that hold a link: fitted to its surface and what is inside it, or tiles of a solid.
 
 A sphere of radius ``r`` whose centre lies ``a`` deep in a solid stands out of it by ``r - a``
-at most; one whose centre lies ``b`` outside, by ``r + b``. With the signed distance ``s`` to
-the surface, both are ``r + s(centre)``: the figure to keep small. The surface is cut into
-small triangles, each of which must lie in one sphere with all its corners (a ball is convex,
-so with all of itself). Three steps, all without chance:
+at most; one whose centre lies ``b`` outside, by ``r + b``: with the signed distance ``s`` to
+the surface, both are ``r + s(centre)``. The surface is cut into small triangles, each of which
+must lie in one sphere. Three steps, all without chance:
 
 1. A greedy choice among centres inside the link, for the smallest ``r + s`` by bisection.
 2. In turns, each triangle goes to the sphere that stands out least by holding it, and each
@@ -32,13 +31,9 @@ from vprism_plan.robots.surfaces import Surface, with_hull
 
 _MOST, _ARM_SIZED = 12, 0.35
 _CENTRES, _MORE_CENTRES = 400, 1000
-# What spheres of an object may stand out by without more of them, as a share of its diagonal.
-_CLOSE = 0.015
-# Where it is of more triangles, as scans are, spheres hold boxes around some of them.
-_MANY = 25_000
-_ROUNDS = 30
-# Relative and absolute (metres): what rounding may take away from a radius.
-_SLACK, _HAIR = 1e-9, 1e-9
+_CLOSE = 0.015  # of an object's diagonal, that spheres may stand out by without more of them
+_MANY, _ROUNDS = 25_000, 30  # triangles beyond which boxes around them are held, as of scans
+_SLACK, _HAIR = 1e-9, 1e-9  # relative, and metres: what rounding may take away from a radius
 _STEPS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 _STEPS /= np.maximum(np.linalg.norm(_STEPS, axis=1, keepdims=True), 1.0)
 
@@ -47,13 +42,12 @@ _STEPS /= np.maximum(np.linalg.norm(_STEPS, axis=1, keepdims=True), 1.0)
 class SphereFit:
     """How spheres are fitted to links that have none.
 
-    Of each link the fewest spheres are taken that stand out by no more than the tolerance,
-    and where ``max_spheres`` do not suffice, so many, which stand out as little as they can.
+    Of each link the fewest spheres are taken that stand out by no more than the tolerance, or
+    ``max_spheres``, which stand out as little as they can.
 
     Attributes:
         tolerance: Metres by which a sphere may stand out of its link.
-        relative: The same as a share of the diagonal of the link's box; the smaller of the
-            two counts, so that fingers are not drowned.
+        relative: The same as a share of the diagonal of the link's box; the smaller counts.
         max_spheres: At most so many for each link: one number, or a table by link. None, and
             links that the table leaves out: 12, and for links whose box has a diagonal above
             0.35 m so many more as their surface is larger, 64 at most.
@@ -308,8 +302,7 @@ def enclosing_spheres(solid: PrimitiveGeometry) -> Spheres:
         return np.array([[*solid.T_link[:3, 3], solid.size[0] + solid.padding]])
     local = _tile_cylinder(*solid.size) if solid.kind == "cylinder" else _tile_box(solid.size)
     local[:, :3] = local[:, :3] @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
-    # Rounding must not open a gap at the corners, nor must a proof of enclosure, which sees a
-    # prism of many sides for a cylinder, find one.
+    # Neither rounding nor a proof, for which a cylinder is a prism, may find a gap at corners.
     local[:, 3] = local[:, 3] * (1.0 + 1e-3) + solid.padding
     return local
 

@@ -92,9 +92,8 @@ class Surface:
 def with_hull(triangles: Triangles) -> Triangles:
     """A surface, and its convex hull if it is a shell whose openings a fill runs out of.
 
-    Published meshes are often shells with holes, their faces turned either way: nothing says
-    what is inside. Where next to none of what the hull holds is enclosed, the link counts as
-    solid up to its hull: all of that is held, and none of it counts as standing out.
+    Published meshes often have holes: where next to none of what the hull holds is enclosed,
+    the link counts as solid up to its hull.
     """
     import trimesh
     from scipy.spatial import ConvexHull, QhullError
@@ -155,11 +154,7 @@ def halved_triangles(triangles: Triangles, edges: Float[np.ndarray, "f 3"]) -> T
 def link_triangles(
     solids: Sequence[PrimitiveGeometry], meshes: Sequence[MeshFile], sides: int = 32
 ) -> Triangles:
-    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`.
-
-    Raises:
-        RobotError: A mesh is missing or cannot be used.
-    """
+    """All surfaces of a link in its frame, metres; see :meth:`PrimitiveGeometry.triangles`."""
     parts = [solid.triangles(sides) for solid in solids] + [mesh.triangles() for mesh in meshes]
     return np.concatenate([np.empty((0, 3, 3)), *parts])
 
@@ -186,11 +181,10 @@ def drawn_points(triangles: Triangles, count: int, seed: int = 0) -> tuple[Point
 
 
 # ------------------------------------------------------------------------ balls inside solids
-# Metres between centres, and by how much balls may fall short of such a point. Together: some
-# thousand balls for an arm, which fall short of its edges by 7 mm at most.
+# Metres between centres, and by how much balls may fall short of such a point: some thousand
+# balls for an arm, which fall short of its edges by 7 mm at most.
 _APART, _SHORT = 0.01, 0.002
-# Deep inside, where the largest balls are in any case, one point in so many is looked after.
-_INNER_SHARE = 8
+_INNER_SHARE = 8  # one in so many points deep inside is looked after: the largest balls are there
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,21 +230,17 @@ def inner_balls(solids: tuple[PrimitiveGeometry, ...], meshes: tuple[Any, ...]) 
 
     Inside a mesh is what its surface encloses, cracks narrower than a cell (a fortieth to an
     eighteenth of its length) being closed. Of a shell with larger holes only the surface is
-    known: balls of radius 0.
-
-    Args:
-        solids: primitives without padding.
-        meshes: `MeshFile`s, or what else has their `triangles`.
-
-    Returns:
-        (n, 4) rows (x, y, z, radius), link frame, metres. Read-only.
+    known: balls of radius 0. Solids are without padding; meshes are `MeshFile`s, or what else
+    has their `triangles`. Returns read-only rows (x, y, z, radius), link frame, metres.
     """
     exact, parts = [np.empty((0, 4))], [np.empty((0, 4))]
     for solid in solids:
         if solid.kind == "sphere":
             exact.append(np.array([[*solid.T_link[:3, 3], solid.size[0]]]))
             continue
-        rows = _of_primitive(solid)
+        # A lattice along the solid's own axes: faces, edges and corners are on it.
+        places = _lattice(solid.kind, solid.size) @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
+        rows = np.column_stack([places, np.maximum(-solid.signed_distance(places), 0.0)])
         # What lies deeper in another solid is that one's to fill.
         for other in solids:
             if other is not solid:
@@ -260,12 +250,6 @@ def inner_balls(solids: tuple[PrimitiveGeometry, ...], meshes: tuple[Any, ...]) 
     found = np.concatenate([*exact, _cover(np.concatenate(parts))])
     found.setflags(write=False)
     return found
-
-
-def _of_primitive(solid: PrimitiveGeometry) -> Spheres:
-    """A lattice along the solid's own axes: faces, edges and corners are on it."""
-    places = _lattice(solid.kind, solid.size) @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
-    return np.column_stack([places, np.maximum(-solid.signed_distance(places), 0.0)])
 
 
 def _lattice(kind: str, size: Sequence[float]) -> Points:
@@ -290,8 +274,7 @@ def _of_mesh(triangles: Triangles) -> Spheres:
     """Points of the surface, and the middles of cells that it encloses.
 
     In triangles without an edge longer than `_APART` every point is at most that over sqrt(3)
-    from a corner. That way is square to the one from the middle to the nearest point (along
-    an edge or face of its triangle), so the latter is at least the cathetus.
+    from a corner, square to the way from the middle to the nearest point: a cathetus at least.
     """
     from scipy.spatial import cKDTree
 
@@ -306,10 +289,7 @@ def _of_mesh(triangles: Triangles) -> Spheres:
 
 
 def _cover(rows: Spheres) -> Spheres:
-    """The balls that, up to `_SHORT`, hold all middles near the surface and a share of others.
-
-    Chosen greedily: each time the ball that holds most of what is not held yet.
-    """
+    """Balls, chosen greedily, that hold (up to `_SHORT`) middles near the surface and others."""
     from scipy.spatial import cKDTree
 
     near = rows[:, 3] < _APART
