@@ -9,11 +9,10 @@ import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
 from numpy.random import Generator
 
 from vprism_plan._arguments import number
-from vprism_plan._shapes import Chosen, Points, Values, Vector
+from vprism_plan._shapes import Chosen, Indices, Points, Values, Vector
 from vprism_plan.errors import ObservationError, PlaneNotFoundError
 from vprism_plan.perception.camera import backproject, inlier_band, invert_transform
 from vprism_plan.perception.observation import Observation
@@ -100,8 +99,7 @@ def fit_plane(
     # 'up' is only a hint, since a camera may be mounted upside down.
     scores = []
     for candidate, share in zip(candidates, carried, strict=True):
-        cosine = float(np.clip(candidate.plane.normal @ _up(obs), -1.0, 1.0))
-        upright = 1.0 + 0.5 * cosine
+        upright = 1.0 + 0.5 * float(np.clip(candidate.plane.normal @ _up(obs), -1.0, 1.0))
         if obs.posed and _is_level(candidate.plane, obs):
             upright *= _LEVEL_BONUS
         scores.append(float(candidate.inliers.sum()) * (least + min(1.0, float(share))) * upright)
@@ -116,7 +114,7 @@ def fit_plane(
     return plane.transformed(obs.pose)
 
 
-def _choose(count: int, rng: Generator) -> Int[np.ndarray, " m"]:
+def _choose(count: int, rng: Generator) -> Indices:
     if count <= _MAX_POINTS:
         return np.arange(count)
     return np.sort(rng.choice(count, size=_MAX_POINTS, replace=False))
@@ -137,7 +135,6 @@ def _peel(
     points: Points, band: Values, among: Chosen, min_share: float, rng: Generator, up: Vector | None
 ) -> tuple[list[_Candidate], list[tuple[float, float]]]:
     """Peel the largest (level) planes off some of the points; return share, `below` of others."""
-
     remaining = np.flatnonzero(among)
     found: list[_Candidate] = []
     rejected: list[tuple[float, float]] = []
@@ -259,19 +256,16 @@ def _hypotheses(points: Points, rng: Generator) -> tuple[Points, Values]:
 
 
 def _why_not(rejected: list[tuple[float, float]], min_share: float) -> str:
-    remedy = "is the table in view, and is depth in metres?"
+    largest = 100 * max((share for share, _ in rejected), default=0.0)
     if not rejected:
-        return f"no three background points span a plane; {remedy}"
-    largest = max(share for share, _ in rejected)
-    if largest < min_share:
-        return (
-            f"the largest plane holds {100 * largest:.1f} % of the background, at least "
-            f"{100 * min_share:g} % is needed (min_share); {remedy}"
-        )
-    return (
-        f"the largest flat region ({100 * largest:.0f} % of the background) is a slice "
-        f"through something curved or noisy, not a surface; {remedy}"
-    )
+        found = "no three background points span a plane"
+    elif largest < 100 * min_share:
+        needed = f"at least {100 * min_share:g} % is needed (min_share)"
+        found = f"the largest plane holds {largest:.1f} % of the background, {needed}"
+    else:
+        region = f"the largest flat region ({largest:.0f} % of the background)"
+        found = f"{region} is a slice through something curved or noisy, not a surface"
+    return f"{found}; is the table in view, and is depth in metres?"
 
 
 # ----------------------------------------------------------------------- what stands on a plane

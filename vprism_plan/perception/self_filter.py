@@ -79,10 +79,8 @@ def ignore_robot(
     number("room", room, 0.0, unit="metres")
     places, sizes = to_numpy(centers, "centers"), to_numpy(radii, "radii")
     if places.ndim != 2 or places.shape[1:] != (3,) or sizes.shape != places.shape[:1]:
-        raise ObservationError(
-            f"centers have shape {places.shape} and radii {sizes.shape}; they must be (S, 3) and "
-            "(S,), metres"
-        )
+        found = f"centers have shape {places.shape} and radii {sizes.shape}"
+        raise ObservationError(f"{found}; they must be (S, 3) and (S,), metres")
     sizes = np.where(sizes > 0, sizes.astype(np.float64), -np.inf)  # no padding mends these
     marked = _with_balls(observation, places, sizes + padding, sizes + room)
     if room > 0.0:
@@ -208,10 +206,8 @@ def _without_own_labels(observation: Observation, inner: Balls, thick: Values) -
 def _objects(observation: Observation) -> list[tuple[int, Points]]:
     """Ids, and points in the camera frame, of the objects."""
     points = backproject(observation.depth, observation.intrinsics)
-    return [
-        (i, points[(observation.labels == i) & (observation.depth > 0)])
-        for i in observation.object_ids
-    ]
+    seen = observation.depth > 0
+    return [(i, points[(observation.labels == i) & seen]) for i in observation.object_ids]
 
 
 def _labels_on_robot(observation: Observation) -> list[str]:

@@ -168,8 +168,10 @@ def attached(
     sits = Attachment(carrier.frame, carrier.T @ T)
     siblings = [other for other, parent in robot.attached.items() if parent == link]
     reasons = dict.fromkeys(siblings, "Attached to the same link") | {link: "Attached"}
-    for touched in (member for entry in touch_links for member in _members(robot, entry)):
-        reasons.setdefault(touched, "Touch link")
+    for entry in touch_links:
+        members = (entry,) if entry in robot._links else robot.groups.get(entry)
+        for touched in robot.links_of(entry) if members is None else members:
+            reasons.setdefault(touched, "Touch link")
     tested = [i for i, other in enumerate(robot.link_names) if other not in reasons]
     arrays = _with_link(robot.arrays, sits, held.spheres, tested)
     names = (*robot.link_names, name)
@@ -225,13 +227,6 @@ def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
     whole(f"{what}: max_spheres", max_spheres, 1, error=RobotError)
     triangles = read_triangles(mesh, what)
     return Held(hold_object(triangles, max_spheres), triangles)
-
-
-def _members(robot: Any, name: str) -> tuple[str, ...]:
-    """Links of a link or group, with or without spheres."""
-    if name in robot._links:
-        return (name,)
-    return tuple(robot.groups[name] if name in robot.groups else robot.links_of(name))
 
 
 def _with_link(

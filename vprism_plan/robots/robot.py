@@ -270,9 +270,8 @@ class Robot:
         members = tuple(link for link in self.groups.get(name, ()) if link in self.link_names)
         if members:
             return members
-        what = "is"
-        if name in self.groups or name in self._links:
-            what = "has no collision spheres, so it is"
+        known = name in self.groups or name in self._links
+        what = "has no collision spheres, so it is" if known else "is"
         raise RobotError(
             f"{name!r} {what} no link or group of {self.name} to check; "
             f"links: {list(self.link_names)}, groups: {sorted(self.groups)}"

@@ -18,6 +18,7 @@ from vprism_plan.errors import RobotError
 from vprism_plan.robots.plain_xml import robot_element
 from vprism_plan.robots.urdf import RobotModel
 
+Names = dict[str, tuple[str, ...]]
 RIGID = "Rigid"  # why a pair is not tested, where no joint moves its links
 _logger = logging.getLogger(__name__)
 
@@ -26,8 +27,8 @@ _logger = logging.getLogger(__name__)
 class SemanticModel:
     """What an SRDF adds to a URDF, in file order."""
 
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)  # names of joints
-    group_links: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    groups: Names = field(default_factory=dict)  # of joints
+    group_links: Names = field(default_factory=dict)
     # (state, group) -> joint -> value
     states: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
     disabled: dict[frozenset[str], str] = field(default_factory=dict)  # pair -> reason
@@ -66,18 +67,15 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
         return SemanticModel(groups, links, states, disabled)
 
 
-def _groups(
-    root: ET.Element, model: RobotModel, path: Path
-) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
+def _groups(root: ET.Element, model: RobotModel, path: Path) -> tuple[Names, Names]:
     """The joints and the links of every group: as in MoveIt, what its joints move directly."""
-    groups: dict[str, tuple[str, ...]] = {}
-    links: dict[str, tuple[str, ...]] = {}
+    groups: Names = {}
+    links: Names = {}
     parent_of = {joint.child: joint for joint in model.joints}
     # A virtual joint ties the base to the world; it is no joint of the URDF.
     virtual = {element.get("name", "") for element in root.findall("virtual_joint")}
     for group in root.findall("group"):
-        joints: list[str] = []
-        named: list[str] = []
+        joints, named = list[str](), list[str]()
         for member in group:
             name = member.get("name", "")
             if member.tag == "joint" and name not in virtual:
@@ -92,18 +90,16 @@ def _groups(
                 named += links[name]
             elif member.tag == "chain":
                 base = _known(member.get("base_link", ""), model.links, "link", path)
-                tip = _known(member.get("tip_link", ""), model.links, "link", path)
+                tip = link = _known(member.get("tip_link", ""), model.links, "link", path)
                 chain: list[str] = []
-                while tip != base:
-                    if tip not in parent_of:
-                        raise RobotError(
-                            f"group '{group.get('name')}' in '{path}': "
-                            f"'{base}' is not above '{member.get('tip_link')}'"
-                        )
-                    chain.append(parent_of[tip].name)
-                    tip = parent_of[tip].parent
-                joints += reversed(chain)
-                named += [model.joint_map[joint].child for joint in reversed(chain)]
+                while link != base:
+                    if link not in parent_of:
+                        where = f"group '{group.get('name')}' in '{path}'"
+                        raise RobotError(f"{where}: '{base}' is not above '{tip}'")
+                    chain.insert(0, link)
+                    link = parent_of[link].parent
+                joints += [parent_of[link].name for link in chain]
+                named += chain
         groups[group.get("name", "")] = tuple(dict.fromkeys(joints))
         links[group.get("name", "")] = tuple(dict.fromkeys(named))
     return groups, links
@@ -122,10 +118,9 @@ def _states(
             except ValueError:
                 values[name] = math.nan
             if not math.isfinite(values[name]):
+                where = f"state '{state.get('name')}' in '{path}'"
                 found = f"gives joint '{name}' the value {joint.get('value')!r}"
-                raise RobotError(
-                    f"state '{state.get('name')}' in '{path}' {found}; give one finite number"
-                )
+                raise RobotError(f"{where} {found}; give one finite number")
         states[state.get("name", ""), state.get("group", "")] = values
     return states
 
@@ -189,12 +184,8 @@ def lock_values(
     values = {}
     for name in rest:
         joint = model.joint_map[name]
-        stated = semantics.state_value(name)
-        if name in given:
-            value = float(given[name])
-        elif stated is not None:
-            value = stated
-        else:
+        value = float(given[name]) if name in given else semantics.state_value(name)
+        if value is None:
             value = min(max(0.0, joint.lower), joint.upper)
         within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
         if not (math.isfinite(value) and within):
@@ -220,10 +211,8 @@ def write_srdf(path: str | Path, robot: Any) -> None:
         )
     root = ET.Element("robot", {"name": robot.name})
     of_joints = {"arm": robot.joint_names}
-    states = [
-        ("arm", name, dict(zip(robot.joint_names, q, strict=True)))
-        for name, q in robot.named_states.items()
-    ]
+    named = robot.named_states.items()
+    states = [("arm", name, dict(zip(robot.joint_names, q, strict=True))) for name, q in named]
     if robot.locked:
         of_joints["locked"] = tuple(robot.locked)
         states.append(("locked", "locked", robot.locked))
@@ -238,8 +227,7 @@ def write_srdf(path: str | Path, robot: Any) -> None:
         for joint, value in values.items():
             ET.SubElement(element, "joint", {"name": joint, "value": repr(float(value))})
     for pair in sorted(disabled.keys() - set(passing), key=sorted):
-        first, last = sorted(pair)[0], sorted(pair)[-1]
-        ends = {"link1": first, "link2": last, "reason": disabled[pair]}
+        ends = {"link1": min(pair), "link2": max(pair), "reason": disabled[pair]}
         ET.SubElement(root, "disable_collisions", ends)
     ET.indent(root)
     write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n")

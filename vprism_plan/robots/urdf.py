@@ -283,15 +283,12 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in link_map:
-                raise RobotError(
-                    f"joint '{joint.name}' in '{path}' refers to unknown link '{link}'; "
-                    f"links: {sorted(link_map)}"
-                )
+                found = f"joint '{joint.name}' in '{path}' refers to unknown link '{link}'"
+                raise RobotError(f"{found}; links: {sorted(link_map)}")
         if joint.child in parent_joint:
-            raise RobotError(
-                f"link '{joint.child}' in '{path}' has two parent joints: "
-                f"'{parent_joint[joint.child].name}' and '{joint.name}'; a URDF is a tree"
-            )
+            both = f"'{parent_joint[joint.child].name}' and '{joint.name}'"
+            found = f"link '{joint.child}' in '{path}' has two parent joints: {both}"
+            raise RobotError(f"{found}; a URDF is a tree")
         parent_joint[joint.child] = joint
     roots = [link.name for link in links if link.name not in parent_joint]
     if len(roots) != 1:
@@ -319,10 +316,9 @@ def _check_mimics(model: RobotModel, path: Path) -> None:
         while current.mimic is not None:
             driver = current.mimic[0]
             if driver not in model.joint_map or not model.joint_map[driver].moves:
-                raise RobotError(
-                    f"joint '{current.name}' in '{path}' mimics '{driver}', which is no moving "
-                    f"joint; valid: {[j.name for j in model.joints if j.moves]}"
-                )
+                found = f"joint '{current.name}' in '{path}' mimics '{driver}'"
+                valid = [j.name for j in model.joints if j.moves]
+                raise RobotError(f"{found}, which is no moving joint; valid: {valid}")
             if driver in seen:
                 raise RobotError(f"joint '{joint.name}' in '{path}' mimics itself through {seen}")
             seen.add(driver)
