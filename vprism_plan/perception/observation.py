@@ -276,10 +276,8 @@ def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
         found = f"focal lengths fx = {fx:g}, fy = {fy:g}"
         raise ObservationError(f"intrinsics are singular: {found} must be positive pixels")
     if max(abs(skew), abs(other_skew)) > 1e-6 * fx:
-        raise ObservationError(
-            f"intrinsics have skew ({skew:g}, {other_skew:g}); only a pinhole camera "
-            "without skew is supported: rectify the image first"
-        )
+        remedy = "only a pinhole camera without is supported: rectify the image first"
+        raise ObservationError(f"intrinsics have skew ({skew:g}, {other_skew:g}); {remedy}")
     matrix[0, 1] = matrix[1, 0] = 0.0
     height, width = shape
     if not (0 <= cx <= width and 0 <= cy <= height):
@@ -305,10 +303,8 @@ def check_color(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return a (H, W, 3) uint8 image of the depth's shape."""
     color = to_numpy(value, "color")
     if color.shape != (*shape, 3) or color.dtype != np.uint8:
-        raise ObservationError(
-            f"color has shape {color.shape} and type {color.dtype}; it must be RGB uint8 of "
-            f"shape {(*shape, 3)}, registered to the depth"
-        )
+        found = f"color has shape {color.shape} and type {color.dtype}"
+        raise ObservationError(f"{found}; it must be RGB uint8 of shape {(*shape, 3)}")
     return np.ascontiguousarray(color)
 
 
@@ -316,17 +312,13 @@ def check_robot_spheres(value: Any) -> np.ndarray:
     """Return float64 rows (x, y, z, radius) or (x, y, z, radius, free), metres."""
     spheres = to_numpy(value, "robot_spheres")
     if spheres.ndim != 2 or spheres.shape[1] not in (4, 5):
-        raise ObservationError(
-            f"robot_spheres have shape {spheres.shape}; they must be rows (x, y, z, radius) or "
-            "(x, y, z, radius, free) in metres, camera frame"
-        )
+        wanted = "they must be rows (x, y, z, radius) or (x, y, z, radius, free), metres"
+        raise ObservationError(f"robot_spheres have shape {spheres.shape}; {wanted}")
     spheres = spheres.astype(np.float64)
     radii = spheres[:, 3:]
     bad = ~np.isfinite(spheres).all(axis=1) | (radii < 0.0).any(axis=1) | ~(radii > 0.0).any(axis=1)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        raise ObservationError(
-            f"row {row} of robot_spheres is {spheres[row].tolist()}; centre and radius must be "
-            "finite and the radius positive"
-        )
+        wanted = "centre and radius must be finite and the radius positive"
+        raise ObservationError(f"row {row} of robot_spheres is {spheres[row].tolist()}; {wanted}")
     return np.ascontiguousarray(spheres)

@@ -35,10 +35,8 @@ class Plane:
         normal = np.array(self.normal, dtype=np.float64)
         offset = float(self.offset)
         if normal.shape != (3,) or not np.isfinite(normal).all() or not np.isfinite(offset):
-            raise ObservationError(
-                f"plane normal {normal.tolist()} and offset {offset} must be a finite 3-vector "
-                "and a finite number of metres"
-            )
+            found = f"plane normal {normal.tolist()} and offset {offset}"
+            raise ObservationError(f"{found} must be a finite 3-vector and finite metres")
         length = float(np.linalg.norm(normal))
         if length < 1e-9:
             raise ObservationError("plane normal is zero; it must point away from the surface")

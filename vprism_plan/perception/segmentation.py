@@ -106,10 +106,8 @@ def segment_tabletop(
     height[obs.sees_robot] = -np.inf  # neither a surface nor something that stands on it
     on_plane = (depth > 0) & (np.abs(height) < inlier_band(depth, 0.01))
     if on_plane.sum() < 3:
-        raise PlaneNotFoundError(
-            f"{int(on_plane.sum())} observed points lie on the given plane; check its frame and "
-            "units, or let it be fitted"
-        )
+        found = f"{int(on_plane.sum())} observed points lie on the given plane"
+        raise PlaneNotFoundError(f"{found}; check its frame and units, or let it be fitted")
     region = table_region(plane, points[on_plane])
     if remove_flying:
         image = surface_image(depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))

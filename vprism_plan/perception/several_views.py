@@ -25,8 +25,7 @@ from vprism_plan.perception.camera import (
 from vprism_plan.perception.observation import Observation
 
 # Metres at the objects by which a view may lie off the others: named beyond the first, refused
-# beyond the second. A slight turn about its camera is no fault: hands and eyes are calibrated
-# no better.
+# beyond the second. Hands and eyes are calibrated to a slight turn, which is no fault.
 NAMED_OFFSET, REFUSED_OFFSET = 0.01, 0.05
 TOLERATED_TURN = np.radians(1.5)
 _NEAREST_VIEWS = 3  # that a view is laid on; more say nothing new

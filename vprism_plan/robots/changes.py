@@ -261,8 +261,6 @@ def _sphere_rows(spheres: object, what: str) -> Spheres:
         raise RobotError(f"{what}: spheres have shape {rows.shape}; {wanted}")
     bad = np.flatnonzero(~(np.isfinite(rows).all(axis=1) & (rows[:, 3] > 0.0)))
     if len(bad):
-        raise RobotError(
-            f"{what}: sphere {int(bad[0])} is {rows[bad[0]].tolist()}; centre and radius must be "
-            "finite and the radius positive (metres)"
-        )
+        found = f"{what}: sphere {int(bad[0])} is {rows[bad[0]].tolist()}"
+        raise RobotError(f"{found}; centre and radius must be finite and the radius positive")
     return rows

@@ -20,18 +20,10 @@ from vprism_plan._arguments import rigid_pose
 from vprism_plan._read_only import make_read_only
 from vprism_plan._shapes import Pairs, Pose
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import changes, pairs, surfaces
+from vprism_plan.robots import changes, kinematics, pairs, surfaces
 from vprism_plan.robots.changes import Held
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
-from vprism_plan.robots.kinematics import (
-    Attachment,
-    KinematicArrays,
-    TorchKinematics,
-    build_arrays,
-    frame_poses,
-    joint_values,
-    reach_bound,
-)
+from vprism_plan.robots.kinematics import Attachment, KinematicArrays, TorchKinematics
 from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
 from vprism_plan.robots.sphere_files import link_spheres, write_spheres
 from vprism_plan.robots.sphere_fit import SphereFit
@@ -165,7 +157,7 @@ class Robot:
             "base_pose", np.eye(4) if base_pose is None else base_pose, error=RobotError
         )
         chosen = link_spheres(model, path, spheres, fit or SphereFit())
-        arrays, links = build_arrays(model, active, fixed_values, chosen.rows, base)
+        arrays, links = kinematics.build_arrays(model, active, fixed_values, chosen.rows, base)
         stated = None if srdf is None else semantics.disabled
         tested, disabled, sampled = pairs.choose_pairs(
             model, arrays, chosen, stated, matrix_samples
@@ -255,7 +247,7 @@ class Robot:
     @functools.cached_property
     def reach(self) -> float:
         """Upper bound on how far any sphere gets from the root link's origin, metres."""
-        return reach_bound(self.arrays)
+        return kinematics.reach_bound(self.arrays)
 
     def links_of(self, name: str) -> tuple[str, ...]:
         """The links with collision spheres that a name stands for.
@@ -295,7 +287,9 @@ class Robot:
 
         if not isinstance(q, torch.Tensor):
             with torch.no_grad():
-                return self.sphere_centers(torch.tensor(joint_values(q, self, "q"))).numpy()
+                return self.sphere_centers(
+                    torch.tensor(kinematics.joint_values(q, self, "q"))
+                ).numpy()
         if q.ndim == 0 or q.shape[-1] != self.dof:
             raise RobotError(f"q has shape {tuple(q.shape)}; expected {self._expected('(..., ')}")
         if not bool(torch.isfinite(q.detach()).all()):
@@ -311,7 +305,7 @@ class Robot:
         Raises:
             RobotError: See :meth:`check_configuration`.
         """
-        R, t = frame_poses(self.arrays, self.check_configuration(q)[None])
+        R, t = kinematics.frame_poses(self.arrays, self.check_configuration(q)[None])
         poses = {}
         for link, sits in self._links.items():
             frame = np.eye(4)
@@ -342,12 +336,10 @@ class Robot:
         Raises:
             RobotError: The length is wrong or a value is not a finite number.
         """
-        array = joint_values(q, self, "a configuration")
+        array = kinematics.joint_values(q, self, "a configuration")
         if array.shape != (self.dof,):
-            raise RobotError(
-                f"a configuration of {self.name} has shape {array.shape}; "
-                f"expected {self._expected('(')}"
-            )
+            found = f"a configuration of {self.name} has shape {array.shape}"
+            raise RobotError(f"{found}; expected {self._expected('(')}")
         if not np.isfinite(array).all():
             named = zip(self.joint_names, array.tolist(), strict=True)
             bad = {name: value for name, value in named if not math.isfinite(value)}
@@ -356,8 +348,7 @@ class Robot:
 
     @functools.cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What is usable but odd: links that stand out of the spheres that a file gives them, by
-        samples of their surface, and links that nothing checks; with the remedy."""
+        """What is usable but odd: links that stand out of their spheres, or that nothing checks."""
         return robot_warnings(self)
 
     def with_base_pose(self, base_pose: ArrayLike) -> Robot:
@@ -463,8 +454,7 @@ class Robot:
         return pairs.touching_shares(self.arrays, self.link_names, samples, seed)
 
     def write_spheres(self, path: str | Path) -> None:
-        """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is
-        read from then on, which spares the fit. Reading gives the same numbers, bit by bit.
+        """Write ``link_spheres`` as YAML, to be read bit by bit as ``<stem>_spheres.yml``.
 
         The buffer of a file of cuRobo or XRDF is written as ``padding``, apart from the radii;
         that of :meth:`with_padding` is not written.

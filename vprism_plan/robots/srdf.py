@@ -15,7 +15,7 @@ import numpy as np
 
 from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.plain_xml import robot_element
+from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
 from vprism_plan.robots.urdf import RobotModel
 
 Names = dict[str, tuple[str, ...]]
@@ -60,7 +60,7 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     path = Path(path)
     if not path.is_file():
         raise RobotError(f"no SRDF file at '{path}'; give an existing file, or leave srdf=None")
-    with reading(path, "a usable SRDF", RobotError):
+    with reading(path, "a usable SRDF", RobotError, MOST_BYTES):
         root = robot_element(path, "an SRDF")
         groups, links = _groups(root, model, path)
         states, disabled = _states(root, model, path), _disabled(root, model, path)

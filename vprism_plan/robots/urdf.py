@@ -16,7 +16,7 @@ import numpy as np
 from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry, find_mesh
-from vprism_plan.robots.plain_xml import robot_element
+from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 
@@ -84,8 +84,7 @@ class RobotModel:
 
 _FARTHEST_LIMIT = 1e4  # radians or metres; SDF writes 1e16 for "none"
 _SMALLEST, _LARGEST = 1e-6, 1e3  # metres of a solid, which is cut into tiles
-# Tables of a robot grow with the square of its links; PR2 has 90.
-_MOST_LINKS = 1000
+_MOST_LINKS = 1000  # tables of a robot grow with the square of its links; PR2 has 90
 _ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
 # Of each solid, the attributes of its size, and how many numbers these hold.
 _SIZES = {"box": (("size",), 3), "cylinder": (("radius", "length"), 2), "sphere": (("radius",), 1)}
@@ -101,7 +100,7 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
     path = Path(path)
     if not path.is_file():
         raise RobotError(f"no URDF file at '{path}'; give the path of an existing .urdf file")
-    with reading(path, "a usable URDF (check_urdf may say more)", RobotError):
+    with reading(path, "a usable URDF (check_urdf may say more)", RobotError, MOST_BYTES):
         root = robot_element(path, "a URDF")
         if any("xacro" in element.tag for element in root.iter()):
             raise RobotError(f"'{path}' holds xacro macros; expand it first: xacro IN > OUT.urdf")
