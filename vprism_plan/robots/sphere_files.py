@@ -52,7 +52,7 @@ def link_spheres(
     fit: SphereFit,
 ) -> ChosenSpheres:
     """Choose and validate the collision spheres of a robot, see :meth:`Robot.from_urdf`."""
-    has = f"the robot has the links {list(model.links)}"
+    has = f"links: {list(model.links)}"
     named = set(fit.max_spheres) if isinstance(fit.max_spheres, Mapping) else set()
     if named - model.links.keys():
         raise RobotError(f"max_spheres names the links {sorted(named - model.links.keys())}; {has}")
