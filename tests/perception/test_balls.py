@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vprism_plan.perception.balls import within_balls
+from vprism_plan.perception.camera import within_balls
 
 
 @settings(max_examples=30)

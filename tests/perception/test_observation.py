@@ -187,7 +187,7 @@ BAD_INTRINSICS = {
     "last row": (with_value(K, (2, 2), 0.0), "last row"),
     "skew": (with_value(K, (0, 1), 2.0), "skew"),
     "centre outside": (with_value(K, (0, 2), 300.0), "outside the 8x6"),
-    "text": (np.full((3, 3), "x"), "pinhole"),
+    "text": (np.full((3, 3), "x"), "give numbers"),
 }
 
 
@@ -200,9 +200,9 @@ def test_bad_intrinsics_are_named(name):
 
 BAD_POSES = {
     "shape": (np.eye(3), r"\(3, 3\)"),
-    "nan": (with_value(np.eye(4), (0, 3), np.nan), "not finite"),
+    "nan": (with_value(np.eye(4), (0, 3), np.nan), "NaN or infinite"),
     "scaled": (np.diag([2.0, 2, 2, 1]), "not rigid"),
-    "mirrored": (np.diag([1.0, 1, -1, 1]), "mirrors"),
+    "mirrored": (np.diag([1.0, 1, -1, 1]), "determinant -1"),
     "transposed": (look_at((1.0, 0, 1)).T, "last row"),
     "zero": (np.zeros((4, 4)), "last row"),
 }

@@ -165,7 +165,7 @@ def test_objects_on_one_link_may_touch_and_objects_may_carry_objects(robots):
         ({"spheres": [(0, 0, 0.1)]}, r"spheres have shape \(1, 3\)"),
         ({"spheres": [(0, 0, 0, 0.1), (0, 0, 0, 0.0)]}, r"sphere 1 is \[0.0, 0.0, 0.0, 0.0\]"),
         ({"spheres": [(0, np.nan, 0, 0.1)]}, "sphere 0 is .* must be finite"),
-        ({"spheres": "none"}, "spheres are not rows"),
+        ({"spheres": "none"}, "spheres are no array"),
         ({"pose": 2 * np.eye(4)}, "attached object 'mug': pose is not rigid"),
         ({"pose": np.eye(3)}, r"pose has shape \(3, 3\)"),
         ({"touch_links": ["thumb"]}, "'thumb' is no link or group"),

@@ -89,7 +89,7 @@ def test_padding_of_links_and_groups(robots):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"padding": -0.01}, r"padding of all links is -0.01; .* 0 or more"),
+        ({"padding": -0.01}, r"padding of all links is -0.01; .* at least 0"),
         ({"padding": {"hand": -1e-9}}, r"padding of 'hand' is -1e-09"),
         ({"padding": {"panda_hand": np.nan}}, r"padding of 'panda_hand' is nan"),
         ({"padding": np.inf}, "padding of all links is inf"),

@@ -37,7 +37,7 @@ def test_missing_files_are_named(write, tmp_path):
         ),
         ({"joints": ["j1"], "locked": {"j2": np.nan}}, "'j2' is locked at nan"),
         ({"base_pose": np.eye(3)}, r"base_pose has shape \(3, 3\)"),
-        ({"base_pose": "here"}, r"base_pose is not a \(4, 4\) array"),
+        ({"base_pose": "here"}, r"base_pose is no \(4, 4\) array"),
         ({"base_pose": np.full((4, 4), np.nan)}, "NaN"),
         ({"base_pose": np.diag([1.0, 1.0, -1.0, 1.0])}, "determinant -1"),
         ({"base_pose": 2 * np.eye(4)}, "not rigid"),

@@ -1,33 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Pinhole camera geometry: pixels and depth to points, points to pixels; noise, distortion.
 
-Conventions: the camera frame is the optical one (x right, y down, z forward);
-depth is measured along z, in metres; pixel (u, v) = (column, row), and a whole
-number is the *centre* of a pixel (OpenCV).
+The camera frame is the optical one (x right, y down, z forward); depth is measured along z, in
+metres; pixel (u, v) = (column, row), and a whole number is the *centre* of a pixel (OpenCV).
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, Num
+from jaxtyping import Float, Num
 
-# What this package hands around.
-Vector = Float[np.ndarray, " 3"]
-Matrix = Float[np.ndarray, "3 3"]
-Pose = Float[np.ndarray, "4 4"]
-Image = Float[np.ndarray, "h w"]
-Pixels = Bool[np.ndarray, "h w"]
-Ids = Int32[np.ndarray, "h w"]
-PointImage = Float[np.ndarray, "h w 3"]
-Points = Float[np.ndarray, "n 3"]
-Values = Float[np.ndarray, " n"]
-Chosen = Bool[np.ndarray, " n"]
-Indices = Int[np.ndarray, " n"]
+from vprism_plan._shapes import Chosen, Image, Matrix, PointImage, Points, Pose, Values, Vector
 
 
 def pixel_rays(shape: tuple[int, int], intrinsics: Matrix) -> PointImage:
-    """Return, for every pixel, the point of its ray at depth z = 1 (camera frame, metres).
+    """Return, for every pixel, the point of its ray at depth z = 1 (camera frame, metres)."""
 
-    Multiply by depth to get points; the rays are *not* of unit length.
-    """
     height, width = shape
     rays = np.ones((height, width, 3))
     rays[..., 0] = (np.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
@@ -46,12 +32,7 @@ def point_image(depth: Image, intrinsics: Matrix, T_world_camera: Pose) -> Point
     return transform_points(T_world_camera, backproject(depth, intrinsics))
 
 
-def lift(
-    depth: Image,
-    intrinsics: Matrix,
-    row: Int[np.ndarray, "*some"],
-    column: Int[np.ndarray, "*some"],
-) -> Float[np.ndarray, "*some 3"]:
+def lift(depth: Image, intrinsics: Matrix, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Return the camera-frame points (metres) of some pixels, 0 where there is no return."""
     z = depth[row, column].astype(np.float64)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0] * z
@@ -60,12 +41,7 @@ def lift(
 
 
 def project(points: Points, intrinsics: Matrix) -> tuple[Float[np.ndarray, "n 2"], Values]:
-    """Project camera-frame points (metres).
-
-    Returns:
-        Pixel coordinates (u, v), NaN for points in or behind the camera plane (z <= 0),
-        and the depth z of every point (metres, may be negative).
-    """
+    """Project camera-frame points (metres) to pixels (u, v), NaN where z <= 0; return z as well."""
     z = points[:, 2].astype(np.float64)
     safe = np.where(z > 0, z, np.nan)
     u = intrinsics[0, 0] * points[:, 0] / safe + intrinsics[0, 2]
@@ -88,7 +64,41 @@ def invert_transform(transform: Pose) -> Pose:
     return inverse
 
 
+# ------------------------------------------------------------------------------------- robots
+def within_balls(points: Points, balls: Float[np.ndarray, "s 4"]) -> Chosen:
+    """Whether each point lies in a ball, its surface included.
+
+    What is not finite is in no ball, and a radius below 0 holds nothing. A point is in a ball of
+    radius r about c if |x - c|^2 + (R^2 - r^2) <= R^2: a nearest neighbour search in four
+    dimensions, with the root of R^2 - r^2 as the fourth, answers that for all balls with radii
+    up to R at once; down to half of R, so that the fourth does not outweigh the others.
+    """
+    from scipy.spatial import cKDTree
+
+    inside = np.zeros(len(points), dtype=bool)
+    left = np.flatnonzero(np.isfinite(points).all(axis=1))
+    balls = balls[balls[:, 3] >= 0.0]
+    balls = balls[np.argsort(-balls[:, 3], kind="stable")]
+    while len(balls) and len(left):
+        radius = float(balls[0, 3])
+        count = int((balls[:, 3] >= 0.5 * radius).sum())
+        group, balls = balls[:count], balls[count:]
+        low = (group[:, :3] - group[:, 3:]).min(axis=0)
+        high = (group[:, :3] + group[:, 3:]).max(axis=0)
+        near = left[((points[left] >= low) & (points[left] <= high)).all(axis=1)]
+        lifted = np.column_stack([group[:, :3], np.sqrt(radius**2 - group[:, 3] ** 2)])
+        asked = np.column_stack([points[near], np.zeros(len(near))])
+        # The bound of the search is exclusive, and roots round.
+        away, _ = cKDTree(lifted).query(asked, distance_upper_bound=radius * (1.0 + 1e-9) + 1e-12)
+        inside[near[np.isfinite(away)]] = True
+        left = left[~inside[left]]
+    return inside
+
+
 # -------------------------------------------------------------------------------------- noise
+# Three curves on purpose: what is certain must rest on a measured model (`depth_sigma`), while
+# clusters are cut (`stereo_noise`) and planes gathered (`inlier_band`) generously, so that the
+# worst of the cameras in use does not tear a surface apart.
 def depth_sigma(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Axial standard deviation of a consumer depth camera, metres, at a depth in metres.
 
@@ -105,14 +115,12 @@ def stereo_noise(depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shap
     return np.asarray(0.002 * np.maximum(0.5, np.asarray(depth, dtype=np.float64)) ** 2)
 
 
-def inlier_band(
-    depth: Float[np.ndarray, "*shape"], threshold: float
-) -> Float[np.ndarray, "*shape"]:
+def inlier_band(depth: np.ndarray, threshold: float) -> np.ndarray:
     """Half-width (metres) of the band in which a point at this depth counts as on a plane.
 
-    Stereo noise grows with the square of depth: `threshold` up to 1 m, beyond it
-    `threshold * depth^2`, and from 2 m on `4 * threshold`, or else a band at 5 m would
-    take in the table and the floor under it.
+    Several times the noise, as a table is not flat: `threshold` up to 1 m, beyond it
+    `threshold * depth^2`, and from 2 m on `4 * threshold`, or else a band at 5 m would take in
+    the table and the floor under it.
     """
     return np.asarray(threshold * np.clip(np.asarray(depth, dtype=np.float64), 1.0, 2.0) ** 2)
 
@@ -120,10 +128,7 @@ def inlier_band(
 def height_sigma(rays: Points, depth: Values, normal: Vector) -> Values:
     """Standard deviation of the depth noise as it shows along a surface's normal, metres.
 
-    Args:
-        rays: from the camera to what it saw, metres, in the frame of `normal`.
-        depth: of these points, metres.
-        normal: unit vector.
+    `rays` go from the camera to what it saw at these depths, in the frame of the unit `normal`.
     """
     return np.asarray(depth_sigma(depth) * (np.abs(rays @ normal) / depth))
 
@@ -135,12 +140,8 @@ def undistort(
     """Return an image (H, W, ...) as a pinhole camera of the same intrinsics sees it.
 
     By nearest pixel: to blend the depths or the ids of two sides of an edge would invent
-    surfaces. Pixels that the lens did not see are 0: no return, background.
-
-    Args:
-        image: as the lens shows it.
-        coefficients: k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order).
-        intrinsics: valid for the image.
+    surfaces. Pixels that the lens did not see are 0: no return, background. Coefficients are k1
+    k2 p1 p2 k3 k4 k5 k6 (OpenCV's order).
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     (fx, _, cx), (_, fy, cy), _ = intrinsics

@@ -1,27 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Depth images as graphs: which neighbouring pixels lie on one surface.
 
-Everything here is local to the image, so it costs a few array passes and no 3-D
-search. Two neighbours lie on one surface if their depth differs by no more than a
-oblique surface explains, with the sensor's noise on top.
+Two neighbours do if their depth differs by no more than an oblique surface explains, with the
+sensor's noise on top. All is local to the image: a few array passes, no 3-D search.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
 
-from vprism_plan.perception.camera import Image, Indices, Matrix, Pixels, stereo_noise
+from vprism_plan._shapes import Image, Indices, Matrix, Pixels
+from vprism_plan.perception.camera import stereo_noise
 
 # Offsets (rows, columns) of half of the eight neighbours; the other half is symmetric.
 _HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
 # Slant (degrees) beyond which neighbours count as a jump. A pixel is deleted only where no
 # sensor would return anything from a surface; a cut is cheap, since what it cuts off goes
 # back to the nearest cluster, so it may come sooner and catch the mild ramps too.
-_LINK_SLANT = 75.0
-_FLYING_SLANT = 78.0
-_CUT_SLANT = 70.0
+_LINK_SLANT, _FLYING_SLANT, _CUT_SLANT = 75.0, 78.0, 70.0
 _MAX_RAMP = 3
 # Along a step in depth between two objects height changes too; on a table top or the
 # lid of a box it does not, however obliquely it is seen.
@@ -32,25 +29,19 @@ Slices = tuple[slice, slice]
 
 @dataclass(frozen=True, eq=False)
 class SurfaceImage:
-    """What the pixel graph needs to know of a view.
+    """What the pixel graph needs to know of a view."""
 
-    Attributes:
-        depth: (H, W) metres, 0 = no return.
-        height: (H, W) metres above the support plane, any value where there is no return.
-        pitch: (H, W) metres between neighbouring pixels on a surface that faces the camera.
-    """
-
-    depth: Image
-    height: Image
-    pitch: Image
+    depth: Image  # metres, 0 = no return
+    height: Image  # metres above the support plane, any value where there is no return
+    pitch: Image  # metres between neighbouring pixels on a surface that faces the camera
 
     def pairs(
         self, reach: int, slant: float
     ) -> Iterator[tuple[Slices, Slices, np.ndarray, np.ndarray]]:
         """Yield, for each of four directions, pixel pairs `reach` pixels apart.
 
-        Each item is (slices of the first pixel, slices of the second, both have a
-        return, step): step is -1, 0 or 1 for a jump towards the camera, none, or away.
+        That is slices of the first and second pixel, whether both have a return, and -1, 0 or 1
+        for a jump towards the camera, none, or away.
         """
         rows, cols = self.depth.shape
         for unit_row, unit_col in _HALF:
@@ -74,13 +65,8 @@ def surface_image(depth: Image, intrinsics: Matrix, height: Image) -> SurfaceIma
     return SurfaceImage(depth, height, depth / min(intrinsics[0, 0], intrinsics[1, 1]))
 
 
-def graph_edges(
-    image: SurfaceImage, mask: Pixels
-) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
-    """Return the edges between neighbouring pixels of `mask` on one surface.
-
-    Pixels are numbered in the order of `np.flatnonzero(mask)`.
-    """
+def graph_edges(image: SurfaceImage, mask: Pixels) -> tuple[Indices, Indices]:
+    """Return the edges between neighbours of `mask`, counted row by row, on one surface."""
     index = np.cumsum(mask.ravel()).reshape(mask.shape) - 1
     starts, ends = [], []
     for here, there, valid, step in image.pairs(1, _LINK_SLANT):
@@ -90,7 +76,7 @@ def graph_edges(
     return np.concatenate(starts), np.concatenate(ends)
 
 
-def components(count: int, start: Int[np.ndarray, " m"], end: Int[np.ndarray, " m"]) -> Indices:
+def components(count: int, start: Indices, end: Indices) -> Indices:
     """Number the connected components of a graph, from 0."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -102,12 +88,10 @@ def components(count: int, start: Int[np.ndarray, " m"], end: Int[np.ndarray, " 
 def flying_pixels(image: SurfaceImage) -> Pixels:
     """Find pixels that hang in the air between a near and a far surface.
 
-    Stereo and time-of-flight cameras blend the two sides of an edge into a short ramp
-    along the line of sight: in some direction depth jumps the same way on both sides of
-    such a pixel. A ramp of more than three pixels may be the side of a box seen at a
-    glancing angle and stays. A pixel with fewer than two of its eight neighbours on its
-    own surface is a speck and counts too. Pixels at a clean edge have one side on their
-    surface and stay.
+    Stereo and time-of-flight cameras blend the two sides of an edge into a short ramp along the
+    line of sight: in some direction depth jumps the same way on both sides of such a pixel. A
+    ramp of more than three pixels may be the side of a box seen at a glancing angle and stays.
+    A pixel with fewer than two of its eight neighbours on its own surface counts too.
     """
     from scipy import ndimage
 
@@ -121,19 +105,15 @@ def flying_pixels(image: SurfaceImage) -> Pixels:
         close = valid & (step == 0)
         near[here] += close
         near[there] += close
-        ahead, behind = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=np.int8)
-        ahead[here] = step
-        behind[there] = step
+        ahead, behind = np.zeros((2, *shape), dtype=np.int8)
+        ahead[here], behind[there] = step, step
         steep = (ahead != 0) & (ahead == behind)
         ramp |= steep & ~ndimage.binary_opening(steep, structure=line)
     return np.asarray((image.depth > 0) & (ramp | (near < 2)))
 
 
 def jump_pixels(image: SurfaceImage, reach: int = 2) -> Pixels:
-    """Find the pixels within `reach` of a jump in depth: edges, and all but the mildest ramps.
-
-    Cutting the graph here separates objects that the sensor's smoothing glues together.
-    """
+    """Find the pixels within `reach` of a jump in depth: edges, and all but the mildest ramps."""
     jumps = np.zeros(image.depth.shape, dtype=bool)
     for here, there, _, step in image.pairs(reach, _CUT_SLANT):
         jumps[here] |= step != 0

@@ -6,32 +6,28 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Float, Int32
 
+from vprism_plan._arguments import number, rigid_pose
+from vprism_plan._shapes import Pixels, PointImage, Points, Pose, Vector
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.balls import within_balls
-from vprism_plan.perception.camera import backproject, point_image
+from vprism_plan.perception.camera import backproject, point_image, within_balls
 from vprism_plan.perception.plane import Plane
 
 # Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.
 DEFAULT_MAX_RANGE = 10.0
-# No table-top sensor measures this far: a median above it means millimetres.
-MAX_MEDIAN_DEPTH = 50.0
-# No depth sensor measures this near: a median below it means depth was scaled twice.
-MIN_MEDIAN_DEPTH = 0.005
-# With fewer returns within the sensor's range than this share, the unit is wrong, not the rest.
-_USABLE_SHARE = 0.05
-# What np.nan_to_num writes for infinity in single precision; no depth is as large.
-_INFINITE = float(np.finfo(np.float32).max)
-_RIGID_TOLERANCE = 1e-3
+# Metres that no table-top sensor measures: medians beyond are millimetres, or depth scaled twice.
+MIN_MEDIAN_DEPTH, MAX_MEDIAN_DEPTH = 0.005, 50.0
+_USABLE_SHARE = 0.05  # of returns within the sensor's range: with fewer, the unit is wrong
+_INFINITE = float(np.finfo(np.float32).max)  # what np.nan_to_num makes of infinity
+_RIGID = 1e-3  # by how much a rotation may be off orthonormal
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
     """One segmented depth image with its camera, validated once, here.
 
-    Arrays, nested lists and torch tensors are accepted and copied, so a camera driver
-    that reuses its buffers cannot change an observation.
+    Arrays, nested lists and torch tensors are accepted, and copied: drivers reuse buffers.
 
     Attributes:
         depth: (H, W) float32 or float64, metres along the optical axis (not along the ray),
@@ -50,8 +46,7 @@ class Observation:
         warnings: what is usable but odd about this view, one sentence each with its remedy;
             handed on to the map, the world and every verdict.
         max_range: metres of depth beyond which a return is none: what lies there is a driver's
-            value for "no data", or a mirror. A ray that ends nowhere has seen nothing, one that
-            ends 65 m away has "seen" all before it free.
+            value for "no data", or a mirror, and must not make all before it free.
 
     Raises:
         ObservationError: what is wrong, what would be valid, and the remedy.
@@ -68,7 +63,7 @@ class Observation:
     max_range: float = DEFAULT_MAX_RANGE
 
     def __post_init__(self) -> None:
-        max_range = check_max_range(self.max_range)
+        max_range = number("max_range", self.max_range, 0.0, above=True, error=ObservationError)
         depth, found = check_depth(self.depth, max_range)
         checked: dict[str, Any] = {
             "max_range": max_range,
@@ -100,21 +95,20 @@ class Observation:
         return self.T_world_camera is not None
 
     @property
-    def pose(self) -> Float[np.ndarray, "4 4"]:
+    def pose(self) -> Pose:
         """Camera-to-world transform; the identity if unposed."""
         return np.eye(4) if self.T_world_camera is None else self.T_world_camera.copy()
 
     @property
-    def camera_center(self) -> Float[np.ndarray, " 3"]:
+    def camera_center(self) -> Vector:
         """Optical centre in the world frame, metres."""
         return self.pose[:3, 3]
 
     @cached_property
-    def sees_robot(self) -> Bool[np.ndarray, "h w"]:
+    def sees_robot(self) -> Pixels:
         """Pixels without a label whose point lies in one of `robot_spheres`.
 
-        What they see is neither an object nor background: it moves. The ray up to it is
-        free, and what lies behind it is hidden.
+        They see neither an object nor background; what lies behind is hidden.
         """
         seen = np.zeros(self.shape, dtype=bool)
         if self.robot_spheres is None:
@@ -131,8 +125,7 @@ class Observation:
         """Sorted positive labels that occur on at least one pixel with a return."""
         if self.labels is None:
             return ()
-        ids = np.unique(self.labels[self.depth > 0])
-        return tuple(int(i) for i in ids if i > 0)
+        return tuple(np.unique(self.labels[(self.depth > 0) & (self.labels > 0)]).tolist())
 
     def require_objects(self) -> tuple[int, ...]:
         """Return `object_ids`, or explain why there is nothing to map.
@@ -141,9 +134,7 @@ class Observation:
             ObservationError: unlabelled, all background, or labelled only where depth is 0.
         """
         if self.labels is None:
-            raise ObservationError(
-                "the observation has no labels; segment it first: segment_tabletop(obs)"
-            )
+            raise ObservationError("the observation has no labels; use segment_tabletop(obs)")
         if not self.object_ids:
             where = (
                 "every labelled pixel has no depth return (registered images?)"
@@ -157,15 +148,14 @@ class Observation:
             )
         return self.object_ids
 
-    def point_image(self) -> Float[np.ndarray, "h w 3"]:
+    def point_image(self) -> PointImage:
         """World point (metres) behind every pixel, NaN where there is no return."""
         return point_image(self.depth, self.intrinsics, self.pose)
 
-    def points(self) -> tuple[Float[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]:
+    def points(self) -> tuple[Points, Int32[np.ndarray, " n"]]:
         """World points (metres) of the pixels with a return, row by row, and their labels.
 
-        Labels are all 0 if the observation is not segmented. Points of the robot
-        (`sees_robot`) are among them, with label 0.
+        Labels are all 0 if the observation is not segmented. Points of the robot are among them.
         """
         valid = self.depth > 0
         points = self.point_image()[valid]
@@ -183,19 +173,10 @@ def to_numpy(value: Any, name: str) -> np.ndarray:
         array = np.array(value)
     except (ValueError, TypeError) as error:
         raise ObservationError(f"{name} is not an array: {error}") from error
-    if array.dtype == object:
-        raise ObservationError(
-            f"{name} holds Python objects ({type(value).__name__}); give a numeric array"
-        )
+    if array.dtype.kind not in "biuf":
+        kind = "Python objects" if array.dtype == object else array.dtype
+        raise ObservationError(f"{name} holds {kind} ({type(value).__name__}); give numbers")
     return array
-
-
-def check_max_range(value: Any) -> float:
-    """Return the farthest depth that counts as a return, metres."""
-    is_number = isinstance(value, int | float | np.integer | np.floating)
-    if not is_number or isinstance(value, bool) or not (np.isfinite(value) and value > 0):
-        raise ObservationError(f"max_range is {value!r}; it must be a positive number of metres")
-    return float(value)
 
 
 def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -207,13 +188,11 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
     depth = to_numpy(value, "depth")
     if depth.ndim != 2 or 0 in depth.shape:
         raise ObservationError(f"depth has shape {depth.shape}; it must be one image (H, W)")
-    if depth.dtype.kind in "iub":
+    if depth.dtype.kind != "f":
         raise ObservationError(
             f"depth is {depth.dtype}, so it holds raw sensor units; give metres as float: "
             "depth * scale (0.001 for millimetres)"
         )
-    if depth.dtype.kind != "f":
-        raise ObservationError(f"depth is {depth.dtype}; it must be float32 or float64 metres")
     if depth.dtype not in (np.float32, np.float64):
         depth = depth.astype(np.float32 if depth.dtype.itemsize <= 4 else np.float64)
     negative = depth < 0
@@ -245,18 +224,14 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
 def _check_scale(valid: np.ndarray, max_range: float) -> None:
     """Refuse returns (metres, all positive) that are in other units."""
     if valid.size == 0:
-        raise ObservationError(
-            "depth is 0, NaN or infinite everywhere: the sensor returned nothing to map"
-        )
+        raise ObservationError("depth is 0, NaN or infinite everywhere: there is nothing to map")
     usable = valid[valid <= max_range]
     # A value for "no data" may be in most pixels; it is the largest there is.
     body = valid[valid < valid.max()]
     median = float(np.median(body if body.size else valid))
     if median > MAX_MEDIAN_DEPTH and usable.size < _USABLE_SHARE * valid.size:
-        raise ObservationError(
-            f"median depth is {median:g} m, more than {MAX_MEDIAN_DEPTH:g} m: it looks like "
-            "millimetres; multiply by 0.001"
-        )
+        found = f"median depth is {median:g} m, more than {MAX_MEDIAN_DEPTH:g} m"
+        raise ObservationError(f"{found}: it looks like millimetres; multiply by 0.001")
     if usable.size == 0:
         raise ObservationError(
             f"every depth return lies beyond max_range = {max_range:g} m, the nearest at "
@@ -264,67 +239,45 @@ def _check_scale(valid: np.ndarray, max_range: float) -> None:
         )
     median = float(np.median(usable))
     if median < MIN_MEDIAN_DEPTH:
-        raise ObservationError(
-            f"median depth is {median:g} m, less than {MIN_MEDIAN_DEPTH:g} m: it looks as if "
-            "depth was scaled twice; give metres"
-        )
+        found = f"median depth is {median:g} m, less than {MIN_MEDIAN_DEPTH:g} m"
+        raise ObservationError(f"{found}: it looks as if depth was scaled twice; give metres")
 
 
 def check_labels(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return labels as a (H, W) int32 array of the depth's shape, 0 = background."""
     labels = to_numpy(value, "labels")
     if labels.shape != shape:
-        raise ObservationError(
-            f"labels have shape {labels.shape} but depth has {shape}; they must be one image "
-            "registered to the depth"
-        )
+        wanted = "they must be one image registered to the depth"
+        raise ObservationError(f"labels have shape {labels.shape} but depth {shape}; {wanted}")
     if labels.dtype.kind not in "iub":
-        raise ObservationError(
-            f"labels are {labels.dtype}; they must be integers: 0 background, 1, 2, ... objects"
-        )
-    if labels.dtype.kind == "i" and labels.min() < 0:
-        raise ObservationError(
-            f"labels contain {labels.min()}; they must be 0 (background) or positive object ids"
-        )
-    if labels.max() > np.iinfo(np.int32).max:
-        raise ObservationError(f"labels contain {labels.max()}; object ids must fit in int32")
+        wanted = "they must be integers: 0 background, 1, 2, ... objects"
+        raise ObservationError(f"labels are {labels.dtype}; {wanted}")
+    if labels.min() < 0 or labels.max() > np.iinfo(np.int32).max:
+        worst = labels.min() if labels.min() < 0 else labels.max()
+        wanted = "they must be 0 (background) or positive object ids that fit in int32"
+        raise ObservationError(f"labels contain {worst}; {wanted}")
     return np.ascontiguousarray(labels, dtype=np.int32)
-
-
-def _finite_matrix(value: Any, name: str, size: int, what: str) -> np.ndarray:
-    """Return a square, finite float64 matrix whose last row is that of an identity."""
-    matrix = to_numpy(value, name)
-    if matrix.shape != (size, size) or matrix.dtype.kind not in "fiu":
-        raise ObservationError(
-            f"{name}: shape {matrix.shape} and type {matrix.dtype}; it must be {what}"
-        )
-    matrix = matrix.astype(np.float64)
-    if not np.isfinite(matrix).all():
-        raise ObservationError(f"{name}: not finite: {matrix.tolist()}")
-    last = np.eye(size)[-1].astype(int).tolist()
-    if not np.allclose(matrix[-1], last, atol=1e-9):
-        raise ObservationError(
-            f"{name}: its last row is {matrix[-1].tolist()}; it must be {last} (is the matrix "
-            "transposed?)"
-        )
-    return matrix
 
 
 def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return a (3, 3) float64 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels."""
-    what = "the 3x3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-    matrix = _finite_matrix(value, "intrinsics", 3, what)
+    matrix = to_numpy(value, "intrinsics")
+    wanted = "it must be the 3x3 pinhole matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+    if matrix.shape != (3, 3):
+        raise ObservationError(f"intrinsics: the matrix has shape {matrix.shape}; {wanted}")
+    matrix = matrix.astype(np.float64)
+    if not np.isfinite(matrix).all():
+        raise ObservationError(f"intrinsics are not finite: {matrix.tolist()}")
+    if not np.allclose(matrix[-1], [0, 0, 1], atol=1e-9):
+        found = f"intrinsics: the matrix has the last row {matrix[-1].tolist()}"
+        raise ObservationError(f"{found}; {wanted} (is it transposed?)")
     (fx, skew, cx), (other_skew, fy, cy), _ = matrix
     if fx <= 0 or fy <= 0:
-        raise ObservationError(
-            f"intrinsics are singular: focal lengths fx = {fx:g}, fy = {fy:g} must be positive "
-            "pixels"
-        )
+        found = f"focal lengths fx = {fx:g}, fy = {fy:g}"
+        raise ObservationError(f"intrinsics are singular: {found} must be positive pixels")
     if max(abs(skew), abs(other_skew)) > 1e-6 * fx:
-        raise ObservationError(
-            f"intrinsics have skew ({skew:g}, {other_skew:g}); only a pinhole camera "
-            "without skew is supported: rectify the image first"
-        )
+        remedy = "only a pinhole camera without is supported: rectify the image first"
+        raise ObservationError(f"intrinsics have skew ({skew:g}, {other_skew:g}); {remedy}")
     matrix[0, 1] = matrix[1, 0] = 0.0
     height, width = shape
     if not (0 <= cx <= width and 0 <= cy <= height):
@@ -335,22 +288,12 @@ def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return matrix
 
 
-def check_pose(value: Any) -> np.ndarray:
+def check_pose(value: Any) -> Float[np.ndarray, "4 4"]:
     """Return a rigid (4, 4) float64 transform; small rounding is removed, more is an error."""
-    what = "a 4x4 rigid transform from camera to world coordinates, or None"
-    pose = _finite_matrix(value, "T_world_camera", 4, what)
+    value = to_numpy(value, "T_world_camera")
+    pose = rigid_pose("T_world_camera", value, tolerance=_RIGID, error=ObservationError)
     rotation = pose[:3, :3]
-    error = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
-    if error > _RIGID_TOLERANCE:
-        raise ObservationError(
-            f"T_world_camera is not rigid: its rotation is off orthonormal by {error:.2g} "
-            f"(at most {_RIGID_TOLERANCE:g}); remove scale and shear"
-        )
-    if np.linalg.det(rotation) < 0:
-        raise ObservationError(
-            "T_world_camera is not rigid: its rotation mirrors (determinant -1); flip one axis"
-        )
-    if error > 1e-12:
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-12:
         u, _, vt = np.linalg.svd(rotation)
         pose[:3, :3] = u @ vt
     return pose
@@ -360,28 +303,22 @@ def check_color(value: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return a (H, W, 3) uint8 image of the depth's shape."""
     color = to_numpy(value, "color")
     if color.shape != (*shape, 3) or color.dtype != np.uint8:
-        raise ObservationError(
-            f"color has shape {color.shape} and type {color.dtype}; it must be RGB uint8 of "
-            f"shape {(*shape, 3)}, registered to the depth"
-        )
+        found = f"color has shape {color.shape} and type {color.dtype}"
+        raise ObservationError(f"{found}; it must be RGB uint8 of shape {(*shape, 3)}")
     return np.ascontiguousarray(color)
 
 
 def check_robot_spheres(value: Any) -> np.ndarray:
     """Return float64 rows (x, y, z, radius) or (x, y, z, radius, free), metres."""
     spheres = to_numpy(value, "robot_spheres")
-    if spheres.ndim != 2 or spheres.shape[1] not in (4, 5) or spheres.dtype.kind not in "fiu":
-        raise ObservationError(
-            f"robot_spheres have shape {spheres.shape} and type {spheres.dtype}; they must be "
-            "rows (x, y, z, radius) or (x, y, z, radius, free) in metres, camera frame"
-        )
+    if spheres.ndim != 2 or spheres.shape[1] not in (4, 5):
+        wanted = "they must be rows (x, y, z, radius) or (x, y, z, radius, free), metres"
+        raise ObservationError(f"robot_spheres have shape {spheres.shape}; {wanted}")
     spheres = spheres.astype(np.float64)
     radii = spheres[:, 3:]
     bad = ~np.isfinite(spheres).all(axis=1) | (radii < 0.0).any(axis=1) | ~(radii > 0.0).any(axis=1)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        raise ObservationError(
-            f"row {row} of robot_spheres is {spheres[row].tolist()}; centre and radius must be "
-            "finite and the radius positive"
-        )
+        wanted = "centre and radius must be finite and the radius positive"
+        raise ObservationError(f"row {row} of robot_spheres is {spheres[row].tolist()}; {wanted}")
     return np.ascontiguousarray(spheres)

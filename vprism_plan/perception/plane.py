@@ -8,15 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan._read_only import make_read_only
+from vprism_plan._shapes import Chosen, Points, Pose, Values, Vector
 from vprism_plan.errors import ObservationError, PlaneNotFoundError
-from vprism_plan.perception.camera import Chosen, Points, Pose, Values, Vector
 
-_CELL = 0.04  # of an extent, metres
-_REGION_CELL = 0.02  # of a table top
-# Gaps up to 10 cm in the visible table (objects and their shadows) do not split it.
-_BRIDGE = 5
-_MAX_CELLS = 1000
-_MIN_PATCH = 0.2
+_CELL, _REGION_CELL = 0.04, 0.02  # metres, of an extent and of a table top
+_BRIDGE = 5  # cells: gaps in the visible table (objects and their shadows) do not split it
+_MAX_CELLS, _MIN_PATCH = 1000, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +21,11 @@ class Plane:
     """The plane {x : normal . x = offset}; the normal points to the side of the camera.
 
     Attributes:
-        normal: (3,) unit vector, read-only.
+        normal: (3,) unit vector, read-only; one of another length is scaled, with its offset.
         offset: metres along the normal.
 
     Raises:
-        ObservationError: the normal is not a finite, non-zero 3-vector, or the offset is
-            not finite. A normal that is not of unit length is scaled, with its offset.
+        ObservationError: the normal is no finite, non-zero 3-vector, or the offset not finite.
     """
 
     normal: Any
@@ -39,10 +35,8 @@ class Plane:
         normal = np.array(self.normal, dtype=np.float64)
         offset = float(self.offset)
         if normal.shape != (3,) or not np.isfinite(normal).all() or not np.isfinite(offset):
-            raise ObservationError(
-                f"plane normal {normal.tolist()} and offset {offset} must be a finite 3-vector "
-                "and a finite number of metres"
-            )
+            found = f"plane normal {normal.tolist()} and offset {offset}"
+            raise ObservationError(f"{found} must be a finite 3-vector and finite metres")
         length = float(np.linalg.norm(normal))
         if length < 1e-9:
             raise ObservationError("plane normal is zero; it must point away from the surface")
@@ -93,10 +87,7 @@ def least_squares_plane(points: Points, weights: Values) -> Plane:
 
 
 def refine(plane: Plane, points: Points, band: Values) -> Plane:
-    """Refit to the points in the band until the set no longer changes.
-
-    Points are weighted by 1 / band^2, so that near, precise ones decide.
-    """
+    """Refit to the points in the band, by 1 / band^2, until the set no longer changes."""
     inliers = np.abs(plane.signed_distance(points)) < band
     for _ in range(20):
         if inliers.sum() < 3:
@@ -117,13 +108,11 @@ def in_grid(grid: Bool[np.ndarray, "r c"], cells: Int[np.ndarray, "n 2"]) -> Cho
     return inside
 
 
-def over_extent(
-    plane: Plane, on_plane: Points, others: Float[np.ndarray, "m 3"], grown: bool = True
-) -> Bool[np.ndarray, " m"]:
+def over_extent(plane: Plane, on_plane: Points, others: Points, grown: bool = True) -> Chosen:
     """Which of `others` have their foot on the plane's visible extent.
 
-    The extent is a grid of 4 cm cells that hold a point of the plane. `grown`, it is closed
-    over gaps of 12 cm and one cell wider: the foot and the shadow of an object are not visible.
+    That is a grid of 4 cm cells that hold a point of the plane. `grown`, it is closed over gaps
+    of 12 cm and one cell wider: the foot and the shadow of an object are not visible.
     """
     from scipy import ndimage
 
@@ -135,8 +124,7 @@ def over_extent(
     # Far strays of a distant floor could span a huge grid: cells are kept within 10 m.
     upper = np.minimum(cells.max(axis=0) + 5, lower + int(10.0 / _CELL))
     grid = np.zeros(upper - lower, dtype=bool)
-    inside = ((cells >= lower) & (cells < upper)).all(axis=1)
-    grid[tuple((cells[inside] - lower).T)] = True
+    grid[tuple((cells[((cells >= lower) & (cells < upper)).all(axis=1)] - lower).T)] = True
     if grown:
         grid = ndimage.binary_dilation(ndimage.binary_closing(grid, iterations=3))
     return in_grid(grid, np.floor(others @ axes.T / _CELL).astype(np.int64) - lower)
@@ -144,15 +132,10 @@ def over_extent(
 
 @dataclass(frozen=True, eq=False)
 class TableRegion:
-    """The convex hull of the visible table top, in the plane's own axes.
-
-    Attributes:
-        axes: (2, 3) directions in the plane.
-        halfplanes: (F, 3) rows (a, b, c): a x + b y + c <= 0 inside, (a, b) of unit length.
-    """
+    """The convex hull of the visible table top, in the plane's own axes."""
 
     axes: Float[np.ndarray, "2 3"]
-    halfplanes: Float[np.ndarray, "f 3"]
+    halfplanes: Float[np.ndarray, "f 3"]  # (a, b, c): a x + b y + c <= 0 inside, (a, b) unit
 
     def contains(self, points: Points, margin: float = 0.0) -> Chosen:
         """Whether the foot of a point lies on the table top, or within `margin` metres of it."""
@@ -166,10 +149,9 @@ class TableRegion:
 def table_region(plane: Plane, on_plane: Points) -> TableRegion:
     """Return the region covered by points on the plane, strays of other surfaces left out.
 
-    A chair seat or a second desk may happen to lie in the same plane: of the patches more
-    than 10 cm apart, those with less than a fifth of the largest one's points are left out.
-    So are strips thinner than 6 cm, where a chair's back beside the table passes through
-    the plane.
+    A chair seat or a second desk may lie in the same plane: of the patches more than 10 cm
+    apart, those with less than a fifth of the largest one's points are left out. So are strips
+    thinner than 6 cm, where a chair's back beside the table passes through the plane.
 
     Raises:
         PlaneNotFoundError: the points cover no patch of 6 cm x 6 cm.
@@ -194,8 +176,6 @@ def table_region(plane: Plane, on_plane: Points) -> TableRegion:
     patches[~grid] = 0
     pixels = np.bincount(patches[tuple((cells - lower).T)], minlength=count + 1)
     kept = grid & (pixels >= _MIN_PATCH * pixels.max())[patches]
-    corners = (np.argwhere(kept) + lower - _MAX_CELLS // 2)[:, None, :] + np.array(
-        [[0, 0], [0, 1], [1, 0], [1, 1]]
-    )
+    corners = (np.argwhere(kept) + lower - _MAX_CELLS // 2)[:, None] + list(np.ndindex(2, 2))
     hull = ConvexHull(corners.reshape(-1, 2) * _REGION_CELL + centre)
     return TableRegion(axes, np.asarray(hull.equations))

@@ -2,69 +2,47 @@
 """Find the surface that the objects stand on, and put the world frame on it.
 
 RANSAC for planes (Fischler and Bolles, 1981) with least-squares refinement, in the camera
-frame. Each point has its own inlier band, since stereo noise grows with the square of depth.
+frame; each point has its own inlier band, since noise grows with depth.
 """
 
 import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from numpy.random import Generator
 
-from vprism_plan.errors import ConfigError, ObservationError, PlaneNotFoundError
-from vprism_plan.perception.camera import (
-    Chosen,
-    Points,
-    Values,
-    Vector,
-    backproject,
-    inlier_band,
-    invert_transform,
-)
+from vprism_plan._arguments import number
+from vprism_plan._shapes import Chosen, Indices, Points, Values, Vector
+from vprism_plan.errors import ObservationError, PlaneNotFoundError
+from vprism_plan.perception.camera import backproject, inlier_band, invert_transform
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane, facing, over_extent, refine
 
 logger = logging.getLogger(__name__)
 
-_MAX_POINTS = 20_000
-_MAX_PLANES = 6
-# Share of the inliers that may lie just below a surface: seen past its edge, not through it.
-_MAX_BELOW = 0.3
-# Objects on a table are rarely taller; what stands higher does not vote for a plane.
-_OBJECT_HEIGHT = 0.4
-# A flat patch larger than this is furniture or a wall, not the side of an object.
-_OBJECT_SIZE = 0.6
-# Cosine of 15 degrees: a surface that things stand on is level within them of a pose's z.
-_LEVEL = float(np.cos(np.radians(15.0)))
-# How many more points a wall needs to be taken for the support of a scene with a pose.
-_LEVEL_BONUS = 20.0
-# Part of the band in which a surface is looked for that the whole band mixes with another.
-_NARROW = 0.4
-# Concentration from which on a plane is a surface, see `_concentration`.
-_CLEAR = 0.8
-# A level surface may hold this part of the share that others need: a board before a wall.
-_LEVEL_SHARE = 0.2
+_MAX_POINTS, _MAX_PLANES = 20_000, 6
+_MAX_BELOW = 0.3  # share of inliers just below a surface: seen past its edge, not through it
+_OBJECT_HEIGHT = 0.4  # metres; what stands higher on a table does not vote for it
+_OBJECT_SIZE = 0.6  # metres; a larger flat patch is furniture or a wall, not the side of an object
+# Cosine of a surface that things stand on with a pose's z; how many more points a wall needs.
+_LEVEL, _LEVEL_BONUS = float(np.cos(np.radians(15.0))), 20.0
+_NARROW = 0.4  # of the band, where the whole band mixes a surface with another
+_CLEAR = 0.8  # concentration from which on a plane is a surface, see `_concentration`
+_LEVEL_SHARE = 0.2  # of the share that others need, for a level surface: a board before a wall
 # Triples of points that are tried, points that score them, the best of them that are refined.
 _HYPOTHESES, _SCORING_POINTS, _NEIGHBOURS, _REFINED = 768, 2000, 100, 8
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A plane with what speaks for it among the points it was fitted to.
-
-    Attributes:
-        plane: camera frame, normal towards the camera.
-        inliers: (N,) which points lie in their band around the plane.
-        below: share of points in the two bands just under the plane, relative to the
-            inliers. Nothing is seen through a surface, so it is near 0 for a real plane
-            and about 1 for a slice through a curved surface or through noise.
-        rms: root mean square distance of the inliers, metres.
-    """
+    """A plane of the camera frame with what speaks for it among the points it was fitted to."""
 
     plane: Plane
-    inliers: Chosen
+    inliers: Chosen  # the points in their band around the plane
+    # Points in the two bands just under the plane, per inlier. Nothing is seen through a
+    # surface: near 0 for a real one, about 1 for a slice through something curved or noisy.
     below: float
-    rms: float
+    rms: float  # of the inliers' distance, metres
 
 
 def fit_plane(
@@ -72,14 +50,14 @@ def fit_plane(
 ) -> Plane:
     """Fit the support plane of the objects, in the world frame, normal towards the camera.
 
-    Seeded RANSAC on up to 20,000 points finds the large planes one after the other, each
-    refined by least squares. Of these the support plane is the one that most points
-    belong to *and stand on*: an empty floor behind the table or a wall has no objects
-    within 0.4 m above its visible extent (other large planes do not count as objects).
-    Points labelled as objects do not vote for a plane; each object stands on the one that its
-    lowest points touch, which the walls of a bin and the back of a shelf are not. Points of
-    the robot (`ignore_robot`) do not vote. Where the observation is posed, a surface within
-    15 degrees of level is preferred to walls, and may hold a fifth of `min_share`.
+    Seeded RANSAC on up to 20,000 points finds the large planes one after the other. Of these
+    the support plane is the one that most points belong to *and stand on*: an empty floor
+    behind the table or a wall has no objects within 0.4 m above its visible extent (other
+    large planes do not count as objects). Points labelled as objects do not vote for a plane;
+    each object stands on the one that its lowest points touch, which the walls of a bin and
+    the back of a shelf are not. Points of the robot (`ignore_robot`) do not vote. Where the
+    observation is posed, a surface within 15 degrees of level is preferred to walls, and may
+    hold a fifth of `min_share`.
 
     Args:
         obs: the observation; labels are used where they exist.
@@ -89,14 +67,11 @@ def fit_plane(
         min_share: smallest share of the pixels with a return that a plane must hold.
 
     Raises:
-        PlaneNotFoundError: no plane is large enough, or none is a surface with empty space
-            beneath it.
-        ConfigError: `threshold` or `min_share` out of range.
+        PlaneNotFoundError: no plane is large enough, or a surface with empty space beneath it.
+        ConfigError: `threshold` (0 to 0.2 m) or `min_share` (0 to 1) out of range.
     """
-    if not 0.0 < threshold <= 0.2:
-        raise ConfigError(f"threshold is {threshold}; it must lie in (0, 0.2] metres")
-    if not 0.0 < min_share <= 1.0:
-        raise ConfigError(f"min_share is {min_share}; it must lie in (0, 1]")
+    number("threshold", threshold, 0.0, 0.2, "metres", above=True)
+    number("min_share", min_share, 0.0, 1.0, above=True)
     valid = (obs.depth > 0) & ~obs.sees_robot
     points = backproject(obs.depth, obs.intrinsics)[valid]
     labels = np.zeros(len(points), dtype=np.int32) if obs.labels is None else obs.labels[valid]
@@ -111,7 +86,7 @@ def fit_plane(
     chosen = _choose(len(standing), rng)
     band = inlier_band(sample[:, 2], threshold)
     everywhere = np.ones(len(sample), dtype=bool)
-    candidates, rejected = _peel(sample, band, everywhere, min_share, rng)
+    candidates, rejected = _peel(sample, band, everywhere, min_share, rng, None)
     candidates += _overlooked(candidates, sample, band, min_share, rng, obs)
     if not candidates:
         raise PlaneNotFoundError(_why_not(rejected, min_share))
@@ -124,8 +99,7 @@ def fit_plane(
     # 'up' is only a hint, since a camera may be mounted upside down.
     scores = []
     for candidate, share in zip(candidates, carried, strict=True):
-        cosine = float(np.clip(candidate.plane.normal @ _up(obs), -1.0, 1.0))
-        upright = 1.0 + 0.5 * cosine
+        upright = 1.0 + 0.5 * float(np.clip(candidate.plane.normal @ _up(obs), -1.0, 1.0))
         if obs.posed and _is_level(candidate.plane, obs):
             upright *= _LEVEL_BONUS
         scores.append(float(candidate.inliers.sum()) * (least + min(1.0, float(share))) * upright)
@@ -140,7 +114,7 @@ def fit_plane(
     return plane.transformed(obs.pose)
 
 
-def _choose(count: int, rng: np.random.Generator) -> Int[np.ndarray, " m"]:
+def _choose(count: int, rng: Generator) -> Indices:
     if count <= _MAX_POINTS:
         return np.arange(count)
     return np.sort(rng.choice(count, size=_MAX_POINTS, replace=False))
@@ -158,17 +132,9 @@ def _is_level(plane: Plane, obs: Observation) -> bool:
 
 # ------------------------------------------------------------------------- planes among points
 def _peel(
-    points: Points,
-    band: Values,
-    among: Chosen,
-    min_share: float,
-    rng: np.random.Generator,
-    up: Vector | None = None,
+    points: Points, band: Values, among: Chosen, min_share: float, rng: Generator, up: Vector | None
 ) -> tuple[list[_Candidate], list[tuple[float, float]]]:
-    """Peel the largest planes off some of the points, one by one; with `up`, level ones only.
-
-    Returns planes, whose `inliers` index into `points`, and share and `below` of what was none.
-    """
+    """Peel the largest (level) planes off some of the points; return share, `below` of others."""
     remaining = np.flatnonzero(among)
     found: list[_Candidate] = []
     rejected: list[tuple[float, float]] = []
@@ -178,15 +144,16 @@ def _peel(
         candidate = _find_plane(points[remaining], band[remaining], rng, up)
         if candidate is None:
             break
-        share = float(candidate.inliers.sum()) / len(points)
         inliers = np.zeros(len(points), dtype=bool)
         inliers[remaining[candidate.inliers]] = True
+        count = int(inliers.sum())
+        share = count / len(points)
         # A ring around the walls of a bin, above the floor that was peeled off, is no surface:
         # other planes' points under its own cells count as well.
         height = candidate.plane.signed_distance(points) / band
         under = points[(height <= -1.0) & (height > -3.0)]
         through = over_extent(candidate.plane, points[inliers], under, grown=False)
-        below = max(candidate.below, float(through.sum()) / max(1, int(inliers.sum())))
+        below = max(candidate.below, float(through.sum()) / max(1, count))
         if share >= min_share and below <= _MAX_BELOW:
             found.append(replace(candidate, inliers=inliers, below=below))
         else:
@@ -204,13 +171,10 @@ def _overlooked(
     points: Points,
     band: Values,
     min_share: float,
-    rng: np.random.Generator,
+    rng: Generator,
     obs: Observation,
 ) -> list[_Candidate]:
-    """Surfaces that the band mixed with others and, with a pose, small level ones.
-
-    A narrow band tells the floor of a bin from the foot of its walls.
-    """
+    """Surfaces that the band mixed, as a bin's floor and walls, and small level ones if posed."""
     clear = [_concentration(c.plane, points, band) >= _CLEAR for c in candidates]
     if all(clear) and not obs.posed:
         return []
@@ -228,24 +192,19 @@ def _overlooked(
 
 
 def _concentration(plane: Plane, points: Points, band: Values) -> float:
-    """Share of the points in the band that lie in its middle half.
-
-    0.8 to 1 for the surface of a real table, a half where a plane cuts through others: the
-    floor of a bin and the foot of its wall together, in a band wider than the noise.
-    """
+    """Share of the points in the band in its middle half: 0.8 to 1 for a table, 0.5 for a mix."""
     height = np.abs(plane.signed_distance(points)) / band
     return float((height < 0.5).sum()) / max(1, int((height < 1.0).sum()))
 
 
 def _find_plane(
-    points: Points, band: Values, rng: np.random.Generator, up: Vector | None
+    points: Points, band: Values, rng: Generator, up: Vector | None
 ) -> _Candidate | None:
     """Return the plane with most points in its band, or None if no triple spans one.
 
     Two thirds of the hypotheses take their three points from one neighbourhood: on a
     cluttered scene three random points rarely share a surface, three neighbours mostly
-    do. The best few are refined on all points before the best is chosen. With `up`, only
-    planes count that are level.
+    do. The best few are refined on all points. With `up`, only level planes count.
     """
     least = -2.0 if up is None else _LEVEL
     up = np.zeros(3) if up is None else up
@@ -276,9 +235,7 @@ def _find_plane(
     return best
 
 
-def _hypotheses(
-    points: Points, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, " m"]]:
+def _hypotheses(points: Points, rng: Generator) -> tuple[Points, Values]:
     """Normals and offsets of planes through triples of points, degenerate triples dropped."""
     from scipy.spatial import cKDTree
 
@@ -299,19 +256,16 @@ def _hypotheses(
 
 
 def _why_not(rejected: list[tuple[float, float]], min_share: float) -> str:
-    remedy = "is the table in view, and is depth in metres?"
+    largest = 100 * max((share for share, _ in rejected), default=0.0)
     if not rejected:
-        return f"no three background points span a plane; {remedy}"
-    largest = max(share for share, _ in rejected)
-    if largest < min_share:
-        return (
-            f"the largest plane holds {100 * largest:.1f} % of the background, at least "
-            f"{100 * min_share:g} % is needed (min_share); {remedy}"
-        )
-    return (
-        f"the largest flat region ({100 * largest:.0f} % of the background) is a slice "
-        f"through something curved or noisy, not a surface; {remedy}"
-    )
+        found = "no three background points span a plane"
+    elif largest < 100 * min_share:
+        needed = f"at least {100 * min_share:g} % is needed (min_share)"
+        found = f"the largest plane holds {largest:.1f} % of the background, {needed}"
+    else:
+        region = f"the largest flat region ({largest:.0f} % of the background)"
+        found = f"{region} is a slice through something curved or noisy, not a surface"
+    return f"{found}; is the table in view, and is depth in metres?"
 
 
 # ----------------------------------------------------------------------- what stands on a plane
@@ -337,23 +291,22 @@ def _furnished(candidates: list[_Candidate], sample: Points, threshold: float) -
 def _touched(
     candidates: list[_Candidate],
     sample: Points,
-    standing: Float[np.ndarray, "m 3"],
-    ids: Int[np.ndarray, " m"],
+    standing: Points,
+    ids: np.ndarray,
     threshold: float,
 ) -> list[float]:
     """How many of the objects each plane carries; 1 is half of them.
 
     An object is carried by the plane that its lowest points come nearest to, of those over
-    whose visible extent it lies and that it does not reach through. All things in a bin
-    lie over its walls as well, but few touch them.
+    whose extent it lies and that it does not reach through: few things in a bin touch its walls.
     """
     numbers = np.unique(ids)
     gaps = np.full((len(candidates), len(numbers)), np.inf)
     for gap, candidate in zip(gaps, candidates, strict=True):
         height = candidate.plane.signed_distance(standing)
         over = over_extent(candidate.plane, sample[candidate.inliers], standing)
-        for index, number in enumerate(numbers):
-            own = ids == number
+        for index, one in enumerate(numbers):
+            own = ids == one
             # Not the very lowest: masks and edges bleed.
             low = float(np.percentile(height[own], 5.0))
             sunk = low < -2.0 * threshold
@@ -367,9 +320,7 @@ def _touched(
     return (share / 0.5).tolist()
 
 
-def standing_on(
-    plane: Plane, on_plane: Points, others: Float[np.ndarray, "m 3"], threshold: float
-) -> Bool[np.ndarray, " m"]:
+def standing_on(plane: Plane, on_plane: Points, others: Points, threshold: float) -> Chosen:
     """Which of `others` stand over the plane's visible extent, within 0.4 m of it."""
     height = plane.signed_distance(others)
     high_enough = height > 2.0 * inlier_band(others[:, 2], threshold)
@@ -383,10 +334,9 @@ def align_to_table(obs: Observation, *, plane: Plane | None = None, seed: int = 
     """Return the observation in a world frame that stands on its support plane.
 
     World z is the plane's normal and the plane is z = 0. The origin is the foot of the
-    objects' mean point (of the plane's own points if the observation is unlabelled).
-    World x is the camera's viewing direction laid into the plane, so the camera looks
-    along +x; seen from straight above, where that direction vanishes, x is the image's
-    upward direction instead. y completes the right-handed frame (left of the view).
+    objects' mean point (of the plane's own points if the observation is unlabelled). World x is
+    the camera's viewing direction laid into the plane; seen from straight above, the image's
+    upward direction. y completes the right-handed frame (left of the view).
 
     Args:
         obs: posed or unposed; an existing pose is replaced.

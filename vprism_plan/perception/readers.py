@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Read an observation from the forms in which people keep them, and write two of these.
 
-Units become metres here, once: 16-bit depth is multiplied by its scale, BOP's millimetres are
-divided by 1000. Lens distortion that a camera file states is undone, since maps know pinholes
-only. Every failure is one clear line.
+Units become metres here, once: 16-bit depth is multiplied by its scale, BOP's millimetres by
+0.001. Lens distortion that a camera file states is undone: maps know pinholes only.
 """
 
 import json
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -17,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vprism_plan import _files
+from vprism_plan._arguments import number
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import invert_transform, undistort
 from vprism_plan.perception.observation import (
@@ -30,8 +29,7 @@ from vprism_plan.perception.plane import Plane
 _KEYS = ("depth", "labels", "intrinsics", "T_world_camera", "color", "plane")
 _NPZ_KEYS = (*_KEYS, "robot_spheres", "max_range")
 _MOST_PIXELS = 2**25  # of an image that is read: 33 million
-# Bytes of all arrays of an archive: the largest image in float64 with labels and color.
-_MOST_UNPACKED = 16 * _MOST_PIXELS
+_MOST_UNPACKED = 16 * _MOST_PIXELS  # bytes of an archive: float64 with labels and color
 # PIL has readers for fifty formats, some of which start other programs.
 _IMAGE_FORMATS = ("PNG", "TIFF", "JPEG", "PPM", "BMP")
 _DEPTH_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I")
@@ -61,8 +59,7 @@ def load_observation(path: str | Path, *, frame: int | None = None) -> Observati
     - a BOP scene folder (`scene_camera.json`, `depth/`, millimetres): `frame` picks the
       image, default the first; labels are the ground-truth index + 1 from
       `mask_visib/`, the pose comes from `cam_R_w2c`, `cam_t_w2c` where present.
-    - a depth image `X-depth.png`: `camera.json` beside it, and optional `X-color.png`,
-      `X-labels.png`.
+    - a depth image `X-depth.png`: `camera.json` beside it, optional `X-color.png`, `X-labels.png`.
 
     Raw depth that is the largest its pixel type holds (65535) is no return.
 
@@ -107,18 +104,14 @@ def _load_npz(path: Path) -> Observation:
         members = [m for m in archive.zip.infolist() if m.filename[:-4] in _NPZ_KEYS]
         unpacked = sum(member.file_size for member in members)
         if unpacked > _MOST_UNPACKED:
-            raise ObservationError(
-                f"{path} unpacks to {unpacked:,} bytes; an observation has at most "
-                f"{_MOST_UNPACKED:,}"
-            )
+            most = f"an observation has at most {_MOST_UNPACKED:,}"
+            raise ObservationError(f"{path} unpacks to {unpacked:,} bytes; {most}")
         content = {key: archive[key] for key in _NPZ_KEYS if key in archive.files}
         found = ", ".join(archive.files) or "nothing"
     for key in ("depth", "intrinsics"):
         if key not in content:
-            raise ObservationError(
-                f"has no {key!r} (found: {found}); an observation needs depth (metres) and "
-                "intrinsics (3x3)"
-            )
+            wanted = "an observation needs depth (metres) and intrinsics (3x3)"
+            raise ObservationError(f"has no {key!r} (found: {found}); {wanted}")
     content["plane"] = _plane(content.get("plane"), "plane")
     content["max_range"] = float(
         _matrix(content.get("max_range", DEFAULT_MAX_RANGE), (), "max_range")
@@ -131,12 +124,11 @@ def _load_images(depth: Path, prefix: str) -> Observation:
     content, raw = _files.read_json(camera, ObservationError), _read_depth(depth)
     for key, size in (("width", raw.shape[1]), ("height", raw.shape[0])):
         if key in content and content[key] != size:
-            raise ObservationError(
-                f"{camera}: {key!r} is {content[key]} but {depth.name} is {raw.shape[1]}x"
-                f"{raw.shape[0]}; scale the intrinsics to the image's resolution"
-            )
+            found = f"{key!r} is {content[key]} but {depth.name} is {raw.shape[1]}x{raw.shape[0]}"
+            remedy = "scale the intrinsics to the image's resolution"
+            raise ObservationError(f"{camera}: {found}; {remedy}")
     fx, fy, cx, cy = (_number(content, key, camera) for key in ("fx", "fy", "cx", "cy"))
-    scale = _positive(content, "depth_scale", camera)
+    scale = _number(content, "depth_scale", camera)
     pose = content.get("T_world_camera")
     if pose is not None:
         pose = _matrix(pose, (4, 4), f"{camera}: 'T_world_camera'")
@@ -149,7 +141,7 @@ def _load_images(depth: Path, prefix: str) -> Observation:
         "color": _read_color(color) if color.is_file() else None,
         "plane": _plane(content.get("plane"), f"{camera}: 'plane'"),
         "robot_spheres": content.get("robot_spheres"),
-        "max_range": _positive(content, "max_range", camera, DEFAULT_MAX_RANGE),
+        "max_range": _number(content, "max_range", camera, DEFAULT_MAX_RANGE),
     }
     return _straight(given, _read_distortion(content, camera))
 
@@ -163,22 +155,17 @@ def _plane(value: Any, what: str) -> Plane | None:
 
 # ---------------------------------------------------------------------------------------- BOP
 def _load_bop(scene: Path, frame: int | None) -> Observation:
-    """Load one image of a BOP scene (bop_toolkit, `docs/bop_datasets_format.md`).
-
-    `scene_camera.json` maps an image number to `cam_K` (9 numbers, row by row),
-    `depth_scale` (raw * scale = millimetres) and optionally `cam_R_w2c`, `cam_t_w2c` (mm).
-    """
+    """Load one image of a BOP scene (bop_toolkit, `docs/bop_datasets_format.md`)."""
     path = scene / "scene_camera.json"
     cameras = _files.read_json(path, ObservationError)
-    numbers = {int(key): key for key in cameras if key.isdecimal()}
-    if not numbers:
+    keys = {int(key): key for key in cameras if key.isdecimal()}
+    if not keys:
         raise ObservationError(f"{path} lists no image; keys must be image numbers")
-    number = min(numbers) if frame is None else frame
-    if number not in numbers:
-        listed = ", ".join(str(n) for n in sorted(numbers)[:10])
-        more = ", ..." if len(numbers) > 10 else ""
-        raise ObservationError(f"{path} has no image {frame}; it has {listed}{more}")
-    key, stem = numbers[number], f"{number:06d}"
+    chosen = min(keys) if frame is None else frame
+    if chosen not in keys:
+        listed = ", ".join(map(str, sorted(keys)[:10])) + (", ..." if len(keys) > 10 else "")
+        raise ObservationError(f"{path} has no image {frame}; it has {listed}")
+    key, stem = keys[chosen], f"{chosen:06d}"
     camera = cameras[key]
     if not isinstance(camera, dict) or "cam_K" not in camera:
         raise ObservationError(f"{path}: image {key} has no 'cam_K' (9 numbers)")
@@ -188,7 +175,7 @@ def _load_bop(scene: Path, frame: int | None) -> Observation:
     raw, color = _read_depth(depth), _existing(scene / "rgb" / stem, ".png", ".jpg")
     what = f"{path}: image {key}"
     given = {
-        "depth": raw * (_positive(camera, "depth_scale", path, 1.0) * _MILLIMETRE),
+        "depth": raw * (_number(camera, "depth_scale", path, 1.0) * _MILLIMETRE),
         "labels": _bop_labels(scene / "mask_visib", stem, raw.shape),
         "intrinsics": _matrix(camera["cam_K"], (3, 3), f"{what} 'cam_K'"),
         "T_world_camera": _bop_pose(camera, what),
@@ -199,7 +186,7 @@ def _load_bop(scene: Path, frame: int | None) -> Observation:
 
 def _existing(stem: Path, *suffixes: str) -> Path | None:
     paths = (stem.with_name(stem.name + suffix) for suffix in suffixes)
-    return next((path for path in paths if path.is_file()), None)
+    return next(filter(Path.is_file, paths), None)
 
 
 def _bop_labels(folder: Path, stem: str, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -246,11 +233,7 @@ def _straight(given: dict[str, Any], lens: Float[np.ndarray, " 8"] | None) -> Ob
 
 
 def _read_distortion(content: dict[str, Any], path: Path) -> Float[np.ndarray, " 8"] | None:
-    """Return k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order) of a camera file; None if it states none.
-
-    Raises:
-        ObservationError: another lens model, or what is no list of 4, 5 or 8 numbers.
-    """
+    """Return k1 k2 p1 p2 k3 k4 k5 k6 (OpenCV's order) of a camera file; None if it states none."""
     key = next((key for key in _LENS_KEYS if content.get(key) is not None), None)
     if key is None:
         values = np.array([_number(content, name, path, 0.0) for name in _LENS_NAMES])
@@ -278,7 +261,8 @@ def _read_distortion(content: dict[str, Any], path: Path) -> Float[np.ndarray, "
 
 
 # ------------------------------------------------------------------------- images and numbers
-def _read_image(path: Path) -> tuple[np.ndarray, str]:
+def _read_image(path: Path, modes: tuple[str, ...], wanted: str) -> tuple[np.ndarray, str]:
+    """Return an image in one of some pixel formats (PIL's modes), and which."""
     from PIL import Image
 
     if not path.is_file():
@@ -288,24 +272,19 @@ def _read_image(path: Path) -> tuple[np.ndarray, str]:
         Image.open(path, formats=_IMAGE_FORMATS) as image,
     ):
         if image.width * image.height > _MOST_PIXELS:
-            raise ObservationError(
-                f"{path} is an image of {image.width} x {image.height} pixels; at most "
-                f"{_MOST_PIXELS:,} are read"
-            )
-        return np.array(image), image.mode
+            size = f"{image.width} x {image.height} pixels; at most {_MOST_PIXELS:,} are read"
+            raise ObservationError(f"{path} is an image of {size}")
+        pixels, mode = np.array(image), image.mode
+    if mode not in modes:
+        raise ObservationError(f"{path} has pixel format {mode}; {wanted}")
+    return pixels, mode
 
 
 def _read_depth(path: Path) -> np.ndarray:
-    """Return raw sensor units (H, W) of a 16-bit single-channel image, 0 = no return.
-
-    The largest value that the pixel type holds means "no data" and becomes 0.
-    """
-    raw, mode = _read_image(path)
-    if mode not in _DEPTH_MODES:
-        raise ObservationError(
-            f"{path} has pixel format {mode}; depth must be a 16-bit single-channel PNG (an "
-            "8-bit image has lost the metric depth: export the raw one)"
-        )
+    """Return raw sensor units (H, W) of a 16-bit image, 0 = no return, also for "no data"."""
+    remedy = "an 8-bit image has lost the metric depth: export the raw one"
+    wanted = f"depth must be a 16-bit single-channel PNG ({remedy})"
+    raw, _ = _read_image(path, _DEPTH_MODES, wanted)
     # 16 bits may arrive in a wider type.
     largest = _UINT16_MAX if raw.max() == _UINT16_MAX else np.iinfo(raw.dtype).max
     return np.where(raw == largest, 0, raw).astype(raw.dtype)
@@ -313,42 +292,25 @@ def _read_depth(path: Path) -> np.ndarray:
 
 def _read_labels(path: Path) -> np.ndarray:
     """Return integer ids (H, W) of a single-channel image, palette images by index."""
-    raw, mode = _read_image(path)
-    if mode not in _LABEL_MODES:
-        raise ObservationError(
-            f"{path} has pixel format {mode}; labels must be a single-channel 8- or 16-bit "
-            "PNG of object ids, 0 for background"
-        )
-    return raw.astype(np.int32)
+    wanted = "labels must be a single-channel 8- or 16-bit PNG of object ids, 0 for background"
+    return _read_image(path, _LABEL_MODES, wanted)[0].astype(np.int32)
 
 
 def _read_color(path: Path) -> np.ndarray:
     """Return (H, W, 3) uint8 RGB; grey images are repeated, alpha is dropped."""
-    raw, mode = _read_image(path)
-    if mode == "L":
-        return np.repeat(raw[..., None], 3, axis=2)
-    if mode not in ("RGB", "RGBA"):
-        raise ObservationError(f"{path} has pixel format {mode}; color must be an 8-bit RGB image")
-    return np.ascontiguousarray(raw[..., :3])
+    raw, mode = _read_image(path, ("L", "RGB", "RGBA"), "color must be an 8-bit RGB image")
+    return np.repeat(raw[..., None], 3, 2) if mode == "L" else np.ascontiguousarray(raw[..., :3])
 
 
 def _number(content: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
     """Return a finite number from a JSON object, or name what is missing."""
-    if key not in content and default is not None:
-        return default
-    value: Any = content.get(key)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if is_number and abs(value) <= sys.float_info.max:  # else float() fails on whole numbers
-        return float(value)
-    found = "is missing" if key not in content else f"is {value!r}"
-    raise ObservationError(f"{path}: {key!r} {found}; it must be a finite number")
-
-
-def _positive(content: dict[str, Any], key: str, path: Path, default: float | None = None) -> float:
-    value = _number(content, key, path, default)
-    if value <= 0:
-        raise ObservationError(f"{path}: {key!r} is {value:g}; it must be positive")
-    return value
+    low = 0.0 if key in ("depth_scale", "max_range") else -np.inf
+    if key in content:
+        value = content[key]
+        return number(f"{path}: {key!r}", value, low, above=True, error=ObservationError)
+    if default is None:
+        raise ObservationError(f"{path}: {key!r} is missing; it must be a finite number")
+    return default
 
 
 def _matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
@@ -358,9 +320,8 @@ def _matrix(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError) as error:
         raise ObservationError(f"{what} is not a matrix of numbers: {error}") from error
     if array.size != int(np.prod(shape)):
-        raise ObservationError(
-            f"{what} has {array.size} numbers; it must have {int(np.prod(shape))} ({shape})"
-        )
+        wanted = f"it must have {int(np.prod(shape))} ({shape})"
+        raise ObservationError(f"{what} has {array.size} numbers; {wanted}")
     return array.reshape(shape)
 
 
@@ -373,8 +334,8 @@ def save_observation(obs: Observation, path: str | Path) -> None:
     interrupted has no `camera.json` and does not load.
 
     Raises:
-        ObservationError: another suffix, depth beyond 65 m or labels beyond 65535 in the
-            folder form, or a parent folder that does not exist.
+        ObservationError: another suffix, no such parent folder or, in the folder form, depth
+            beyond 65 m or labels beyond 65535.
     """
     target = Path(path)
     if not target.parent.is_dir():
@@ -398,15 +359,11 @@ def _save_folder(obs: Observation, plane: list[float] | None, folder: Path) -> N
     scale = 1e-4 if float(obs.depth.max()) < 1e-4 * (_UINT16_MAX - 1) else 1e-3
     raw = np.rint(obs.depth.astype(np.float64) / scale)
     if raw.max() >= _UINT16_MAX:  # the largest value means "no data"
-        raise ObservationError(
-            f"depth reaches {obs.depth.max():g} m, more than 16 bits of millimetres hold; save "
-            "as .npz"
-        )
+        far = f"depth reaches {obs.depth.max():g} m, more than 16 bits of millimetres hold"
+        raise ObservationError(f"{far}; save as .npz")
     if ((raw == 0) & (obs.depth > 0)).any():
-        raise ObservationError(
-            f"depth of {obs.depth[obs.depth > 0].min():g} m would round to 'no return'; save as "
-            ".npz"
-        )
+        near = f"depth of {obs.depth[obs.depth > 0].min():g} m would round to 'no return'"
+        raise ObservationError(f"{near}; save as .npz")
     if obs.labels is not None and obs.labels.max() > _UINT16_MAX:
         raise ObservationError(f"label {obs.labels.max()} does not fit in 16 bits; save as .npz")
     folder.mkdir(exist_ok=True)
@@ -417,8 +374,8 @@ def _save_folder(obs: Observation, plane: list[float] | None, folder: Path) -> N
         path = folder / f"{name}.png"
         if pixels is None:
             path.unlink(missing_ok=True)
-            continue
-        write_atomically(path, partial(Image.fromarray(pixels).save, format="PNG"))
+        else:
+            write_atomically(path, partial(Image.fromarray(pixels).save, format="PNG"))
     (fx, _, cx), (_, fy, cy), _ = obs.intrinsics.tolist()
     content = {
         "width": obs.shape[1],
@@ -431,8 +388,7 @@ def _save_folder(obs: Observation, plane: list[float] | None, folder: Path) -> N
         "robot_spheres": None if obs.robot_spheres is None else obs.robot_spheres.tolist(),
     }
     present = {key: value for key, value in content.items() if value is not None}
-    text = json.dumps(present, indent=2) + "\n"
-    write_atomically(folder / "camera.json", lambda stream: stream.write(text.encode()))
+    _files.write_text(folder / "camera.json", json.dumps(present, indent=2) + "\n")
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from vprism_plan._shapes import Chosen, Points, Vector
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.camera import Points, Vector, inlier_band, pixel_rays
+from vprism_plan.perception.camera import inlier_band, pixel_rays
 from vprism_plan.perception.masks import mend
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane, in_grid, least_squares_plane
@@ -19,12 +19,10 @@ _TILTED, _NO_TABLE = 15.0, 45.0  # degrees off the world's z: named, refused
 _HIGHEST = 6.0  # metres that a camera can be above the surface it looks at
 _UPRIGHT = 10.0  # degrees within which another reading of a pose fits
 _OFF_CENTRE = 0.25  # of the image's size, for the principal point
-_SQUARE = (0.8, 1.25)  # fy / fx
-_LENS = (0.3, 4.0)  # focal length over the image's width
+_SQUARE, _LENS = (0.8, 1.25), (0.3, 4.0)  # fy / fx, and focal length over the image's width
 _WIDE = 0.8  # metres; objects on a table are rarely larger
 _BENT = 0.003  # metres rms that a table may be bent before it is asked why
-_CELL = 0.02  # metres
-_THROUGH = 0.03  # metres below the surface, inside of what was seen of it
+_CELL, _THROUGH = 0.02, 0.03  # metres of a grid, and below the surface that was seen there
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _LINK = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -34,7 +32,7 @@ _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 def examine(
     views: Sequence[Observation], plane: Plane, earlier: Sequence[Observation] = ()
 ) -> tuple[tuple[Observation, ...], tuple[str, ...]]:
-    """Return views fit for use, and what was odd about them.
+    """Return views fit for use, mended where possible, and a sentence for each thing odd in them.
 
     Run once for every view that a map learns from, after its support plane is known.
 
@@ -42,10 +40,6 @@ def examine(
         views: posed as the map will have them.
         plane: support surface, world frame.
         earlier: views of the same scene that went through this before.
-
-    Returns:
-        The views, mended where that was possible, and one sentence for each finding: what is
-        odd, by how much, and the remedy.
 
     Raises:
         ObservationError: a view that cannot be right.
@@ -63,10 +57,9 @@ def _pose(view: Observation, plane: Plane) -> list[str]:
     """Name a table that is not level; refuse what can be none."""
     height = float(plane.signed_distance(view.camera_center))
     if height > _HIGHEST:
-        raise ObservationError(
-            f"the camera is {height:.1f} m above the support surface, more than {_HIGHEST:g} m; "
-            "give depth and T_world_camera in metres: is one of them in millimetres, or scaled?"
-        )
+        remedy = "give depth and T_world_camera in metres: is one in millimetres, or scaled?"
+        where = f"the camera is {height:.1f} m above the support surface"
+        raise ObservationError(f"{where}, more than {_HIGHEST:g} m; {remedy}")
     if not view.posed:
         return []
     tilt = _angle(plane.normal)
@@ -138,7 +131,11 @@ def _bend(view: Observation, plane: Plane) -> list[str]:
     rays = pixel_rays(view.shape, view.intrinsics).reshape(-1, 3)[index]
     as_given = rays * view.depth.reshape(-1)[index, None].astype(np.float64)
     as_length = as_given / np.linalg.norm(rays, axis=1, keepdims=True)
-    given, length = (_rms(p) for p in (as_given, as_length))
+    weights = np.ones(len(index))
+    given, length = (
+        float(np.sqrt(np.mean(least_squares_plane(p, weights).signed_distance(p) ** 2)))
+        for p in (as_given, as_length)
+    )
     if given < _BENT or length > 0.5 * given:
         return []
     return [
@@ -146,11 +143,6 @@ def _bend(view: Observation, plane: Plane) -> list[str]:
         "the length of each ray: depth must be z along the optical axis; divide it by the length "
         "of the ray at z = 1"
     ]
-
-
-def _rms(points: Points) -> float:
-    plane = least_squares_plane(points, np.ones(len(points)))
-    return float(np.sqrt(np.mean(plane.signed_distance(points) ** 2)))
 
 
 def _sizes(view: Observation) -> list[str]:
@@ -193,9 +185,7 @@ def _without_what_is_behind_the_surface(view: Observation, plane: Plane) -> Obse
     return replace(view, depth=np.where(below, 0.0, view.depth), warnings=(*view.warnings, text))
 
 
-def _enclosed(
-    plane: Plane, seen: Points, asked: Float[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, " m"]:
+def _enclosed(plane: Plane, seen: Points, asked: Points) -> Chosen:
     """Which points of a plane lie inside what was seen of it, or in a hole of that."""
     if len(seen) == 0:
         return np.zeros(len(asked), dtype=bool)

@@ -10,17 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy import ndimage
 
+from vprism_plan._arguments import number, whole
+from vprism_plan._shapes import Indices, Pixels, PointImage, Points, Values
 from vprism_plan.errors import ConfigError, PlaneNotFoundError
-from vprism_plan.perception.camera import (
-    Indices,
-    Pixels,
-    PointImage,
-    Points,
-    Values,
-    inlier_band,
-    stereo_noise,
-)
+from vprism_plan.perception.camera import inlier_band, stereo_noise
 from vprism_plan.perception.image_graph import (
     SurfaceImage,
     components,
@@ -38,28 +33,19 @@ logger = logging.getLogger(__name__)
 
 Clusters = Int[np.ndarray, "h w"]
 
-_SPECK_PIXELS = 12
-_SPECK_AREA = 1e-4
-# Sensor noise is removed this far around the table; what is farther away stays as it is.
-_WORKSPACE_MARGIN = 0.1
-_WORKSPACE_HEIGHT = 1.0
-# A cluster belongs to the table if this share of it stands over the table top.
-_MIN_ON_TABLE = 0.6
-
-# Pixels cut off at a depth edge go back to the cluster they are this close to.
-_REACH = 0.015
-# A fragment is at most this share of what it is joined to.
-_FRAGMENT = 0.25
-_CONTACT = 0.1
-_MIN_FRAGMENT = 1e-4
-# Share of a cluster's footprint inside another's hull that makes it a part of the other.
-_INSIDE = 0.7
+_SPECK_PIXELS, _SPECK_AREA = 12, 1e-4
+# Metres around and above the table within which sensor noise is removed.
+_WORKSPACE_MARGIN, _WORKSPACE_HEIGHT = 0.1, 1.0
+_MIN_ON_TABLE = 0.6  # share of a cluster that stands over the table top
+_REACH = 0.015  # from pixels cut off at a depth edge to their cluster
+# A fragment: at most this share of what it is joined to, this share of it near, this large.
+_FRAGMENT, _CONTACT, _MIN_FRAGMENT = 0.25, 0.1, 1e-4
+_INSIDE = 0.7  # share of a cluster's footprint in another's hull that makes it a part of that
 
 _STEP = 0.005  # metres by which the water rises
-# A summit must rise this much over the pass to its neighbour: in metres, and as a share of
-# its height above the table. Rims, knobs and handles do not.
-_PROMINENCE = 0.022
-_RELATIVE_PROMINENCE = 0.25
+# A summit must rise this much over the pass to its neighbour, in metres and as a share of its
+# height above the table. Rims, knobs and handles do not.
+_PROMINENCE, _RELATIVE_PROMINENCE = 0.022, 0.25
 
 
 def segment_tabletop(
@@ -82,28 +68,22 @@ def segment_tabletop(
     between them; stacked objects stay one. Fragments of one object (a handle, the far
     wall of a cup) are joined to it. Labels run from 1, by falling visible area.
 
-    Pixels that see the robot (`ignore_robot`) are left out of all this.
-
-    What is *not* labelled stays background, and so remains an obstacle: clutter too small,
-    too large (`max_size`, `max_height`: walls, people) or not over the table top.
-
-    Flying pixels (`remove_flying`), which stereo sensors invent between the two sides of a
-    depth edge, and specks of at most 12 pixels and 1 cm^2 that no surface continues are set
-    to depth 0, "no return": they would be obstacles in mid-air and cast shadows. This is
-    done only over the table top (10 cm around it, up to 1 m above it); elsewhere no pixel
-    is ever dropped. Ramps of more than three pixels stay, as obstacles: they may be the
-    side of a box seen at a glancing angle.
+    Pixels that see the robot (`ignore_robot`) are left out. What is *not* labelled stays
+    background, and so remains an obstacle: clutter too small, too large (`max_size`,
+    `max_height`: walls, people) or not over the table top.
 
     Args:
         obs: observation; existing labels are replaced.
         plane: support plane in the world frame; default: `obs.plane`, else `fit_plane`.
         seed: seed of the plane fit.
-        min_height: least height over the plane, metres.
-        max_height: largest height of an object, metres.
+        min_height, max_height: of an object over the plane, metres.
         max_size: largest horizontal size of an object, metres.
         min_area: least visible area of an object, square metres, measured facing the camera.
         min_points: least number of pixels of an object.
-        remove_flying: set flying pixels and specks to "no return".
+        remove_flying: set depth to 0, "no return", where stereo sensors invent it between the
+            two sides of a depth edge, and at specks of at most 12 pixels and 1 cm^2: they would
+            be obstacles in mid-air. Only over the table top (10 cm around it, up to 1 m above),
+            and not in ramps of more than three pixels, which may be the side of a box.
 
     Returns:
         The observation with `labels` and `plane` set. If nothing stands on the plane all
@@ -115,12 +95,10 @@ def segment_tabletop(
     """
     limits = {"max_height": max_height, "max_size": max_size, "min_area": min_area}
     for name, value in {"min_height": min_height, **limits}.items():
-        if not (np.isfinite(value) and value > 0):
-            raise ConfigError(f"{name} is {value}; it must be positive (metres)")
+        number(name, value, 0.0, above=True)
+    whole("min_points", min_points, 1)
     if min_height >= max_height:
         raise ConfigError(f"min_height {min_height} must be less than max_height {max_height}")
-    if min_points < 1:
-        raise ConfigError(f"min_points is {min_points}; it must be at least 1")
     unlabelled = replace(obs, labels=None)
     plane = plane or obs.plane or fit_plane(unlabelled, seed=seed)
     points, depth = unlabelled.point_image(), obs.depth.copy()
@@ -128,10 +106,8 @@ def segment_tabletop(
     height[obs.sees_robot] = -np.inf  # neither a surface nor something that stands on it
     on_plane = (depth > 0) & (np.abs(height) < inlier_band(depth, 0.01))
     if on_plane.sum() < 3:
-        raise PlaneNotFoundError(
-            f"{int(on_plane.sum())} observed points lie on the given plane; check its frame and "
-            "units, or let it be fitted"
-        )
+        found = f"{int(on_plane.sum())} observed points lie on the given plane"
+        raise PlaneNotFoundError(f"{found}; check its frame and units, or let it be fitted")
     region = table_region(plane, points[on_plane])
     if remove_flying:
         image = surface_image(depth, obs.intrinsics, np.where(np.isfinite(height), height, 0.0))
@@ -186,14 +162,12 @@ def _cluster_pixels(
     image: SurfaceImage, points: PointImage, plane: Plane, raised: Pixels, min_area: float
 ) -> Clusters:
     """Number the clusters of the raised pixels from 1, 0 = none; see `segment_tabletop`."""
-    from scipy import ndimage
-
-    core = raised & ~jump_pixels(image)
     clusters = np.zeros(raised.shape, dtype=np.int64)
+    if not raised.any():
+        return clusters
+    core = raised & ~jump_pixels(image)
     if not core.any():
         core = raised
-    if not core.any():
-        return clusters
     start, end = graph_edges(image, core)
     height = np.asarray(ndimage.median_filter(image.height, size=3))
     clusters[core] = _split_at_valleys(height[core], image.pitch[core] ** 2, start, end, min_area)
@@ -235,9 +209,7 @@ def _join_fragments(
     candidates = np.flatnonzero(area > _MIN_FRAGMENT)
     order = candidates[np.argsort(-area[candidates], kind="stable")].tolist()
     members = {c: points[clusters == c] for c in order}
-    reach = {
-        c: _REACH + 3.0 * float(np.median(stereo_noise(image.depth[clusters == c]))) for c in order
-    }
+    noise = {c: float(np.median(stereo_noise(image.depth[clusters == c]))) for c in order}
     axes = plane.axes()
     owner = np.arange(len(area))
     for position, big in enumerate(order):
@@ -247,12 +219,12 @@ def _join_fragments(
         for small in order[position + 1 :]:
             if owner[small] != small:
                 continue
-            flat = members[small] @ axes.T
-            joined = outline is not None and bool(
-                (flat @ outline[:, :2].T + outline[:, 2] <= 0.0).all(axis=1).mean() >= _INSIDE
-            )
+            flat, joined = members[small] @ axes.T, False
+            if outline is not None:
+                inside = (flat @ outline[:, :2].T + outline[:, 2] <= 0.0).all(axis=1)
+                joined = bool(inside.mean() >= _INSIDE)
             if not joined and area[small] <= _FRAGMENT * area[big]:
-                joined = _touch(members[big], members[small], reach[small])
+                joined = _touch(members[big], members[small], _REACH + 3.0 * noise[small])
             if joined:
                 owner[small] = big
     return np.asarray(np.unique(owner[clusters], return_inverse=True)[1]).reshape(clusters.shape)
@@ -270,7 +242,7 @@ def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
     return bool(np.isfinite(gap).mean() >= _CONTACT)
 
 
-def _footprint(flat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "f 3"] | None:
+def _footprint(flat: np.ndarray) -> np.ndarray | None:
     """Half-planes of the convex hull of a footprint, or None if it has no area."""
     from scipy.spatial import ConvexHull, QhullError
 
@@ -281,12 +253,8 @@ def _footprint(flat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "f 3"] | Non
 
 
 def _fill_holes(clusters: Clusters, image: SurfaceImage) -> None:
-    """Add the low pixels that a cluster encloses on its own surface: the bottom of a bowl.
-
-    The table seen through the handle of a cup is enclosed too, but depth jumps there.
-    """
-    from scipy import ndimage
-
+    """Add the low pixels that a cluster encloses on its own surface: the bottom of a bowl."""
+    # The table seen through the handle of a cup is enclosed too, but depth jumps there.
     low = (image.depth > 0) & (clusters == 0) & (image.height > 1.5 * stereo_noise(image.depth))
     low &= ~jump_pixels(image, reach=1)
     for cluster, box in enumerate(ndimage.find_objects(clusters), start=1):
@@ -297,24 +265,13 @@ def _fill_holes(clusters: Clusters, image: SurfaceImage) -> None:
 
 # ------------------------------------------------------------------------------------ valleys
 def _split_at_valleys(
-    height: Values,
-    area: Values,
-    start: Int[np.ndarray, " m"],
-    end: Int[np.ndarray, " m"],
-    min_area: float,
+    height: Values, area: Values, start: Indices, end: Indices, min_area: float
 ) -> Indices:
     """Number the hills of a graph of pixels, 0 = in a valley (belongs to the nearest hill).
 
     The graph is flooded from below in steps of 5 mm. Where what is still above water
     falls apart into two pieces or more, each prominent and of at least `min_area`, they are
     different objects; a piece that is neither is part of the same hill.
-
-    Args:
-        height: metres above the table.
-        area: square metres that each pixel stands for.
-        start: first pixel of each edge.
-        end: second pixel of each edge.
-        min_area: smallest visible area of a hill, square metres.
     """
     hills = np.zeros(len(height), dtype=np.int64)
     piece = components(len(height), start, end)
@@ -342,12 +299,7 @@ def _split_at_valleys(
 
 
 def _fall_apart(
-    members: Int[np.ndarray, " k"],
-    height: Values,
-    area: Values,
-    start: Int[np.ndarray, " m"],
-    end: Int[np.ndarray, " m"],
-    min_area: float,
+    members: Indices, height: Values, area: Values, start: Indices, end: Indices, min_area: float
 ) -> list[np.ndarray]:
     """Raise the water until two or more prominent pieces are left; [] if that never happens."""
     heights = height[members]

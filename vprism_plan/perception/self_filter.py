@@ -8,17 +8,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vprism_plan.errors import ConfigError, ObservationError
-from vprism_plan.perception.balls import within_balls
+from vprism_plan._arguments import number
+from vprism_plan._shapes import Pixels, Points, Values
+from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import (
-    Pixels,
-    Points,
-    Values,
     backproject,
     invert_transform,
     project,
     stereo_noise,
     transform_points,
+    within_balls,
 )
 from vprism_plan.perception.image_graph import flying_pixels, surface_image
 from vprism_plan.perception.observation import Observation, to_numpy
@@ -47,21 +46,13 @@ def ignore_robot(
 
     Unlabelled pixels within the padded balls become neither objects nor background
     obstacles, and do not vote for the support plane. The rays up to them remain free space,
-    and what lies behind them is occluded, as behind anything that was seen. Hidden space in
-    the balls themselves, without padding, is free: the robot was there.
+    and what lies behind them is occluded. Hidden space in the balls themselves, without
+    padding, is free: the robot was there.
 
-    That is your word. Balls that stand out of the robot give away space that nobody saw, and
-    clutter there is not seen: for a robot with a URDF, use `ignore_self`. What is seen outranks
-    it: a label within the balls stays and is an obstacle, and behind what was seen in the
-    balls or within 10 cm of them no hidden space is free.
-
-    `padding` is for the errors of the camera's pose and the sensor's noise. For the pictured
-    configuration to be valid, hidden space around its spheres must be free as well: `room`
-    of the checker's margin and twice the world's resolution is enough.
-
-    Flying pixels, which sensors invent along the robot's outline between it and what lies
-    behind, are set to depth 0, "no return" (`remove_flying`): they would be obstacles in
-    mid-air beside the arm. Only pixels within two of one that sees the robot are touched.
+    That is your word. Balls that stand out of the robot give away space that nobody saw: for a
+    robot with a URDF, use `ignore_self`. What is seen outranks it: a label within the balls
+    stays and is an obstacle, and behind what was seen in the balls or within 10 cm of them no
+    hidden space is free.
 
     Called again (a second robot, a tool), it adds to what is marked. Call it after labelling.
 
@@ -69,9 +60,13 @@ def ignore_robot(
         observation: Posed, or else `centers` are in the camera frame.
         centers: (S, 3) world, metres; array or tensor.
         radii: (S,) metres.
-        padding: Metres beyond the balls in which a pixel still sees the robot.
-        room: Metres beyond the balls in which hidden space is free, by your word.
-        remove_flying: Whether flying pixels along the outline are removed.
+        padding: Metres beyond the balls in which a pixel still sees the robot: the error of the
+            camera's pose, and the sensor's noise.
+        room: Metres beyond the balls in which hidden space is free, by your word: the checker's
+            margin and twice the world's resolution make the pictured configuration valid.
+        remove_flying: Whether flying pixels, which sensors invent between the robot and what
+            lies behind it, become "no return" within two pixels of one that sees the robot:
+            they would be obstacles in mid-air.
 
     Returns:
         The observation with `robot_spheres` set, and a warning if `room` is above 0.
@@ -80,14 +75,12 @@ def ignore_robot(
         ObservationError: centres or radii do not fit each other or are not finite.
         ConfigError: a padding or room that is negative or not finite.
     """
-    _check_metres("padding", padding)
-    _check_metres("room", room)
+    number("padding", padding, 0.0, unit="metres")
+    number("room", room, 0.0, unit="metres")
     places, sizes = to_numpy(centers, "centers"), to_numpy(radii, "radii")
     if places.ndim != 2 or places.shape[1:] != (3,) or sizes.shape != places.shape[:1]:
-        raise ObservationError(
-            f"centers have shape {places.shape} and radii {sizes.shape}; they must be (S, 3) and "
-            "(S,), metres"
-        )
+        found = f"centers have shape {places.shape} and radii {sizes.shape}"
+        raise ObservationError(f"{found}; they must be (S, 3) and (S,), metres")
     sizes = np.where(sizes > 0, sizes.astype(np.float64), -np.inf)  # no padding mends these
     marked = _with_balls(observation, places, sizes + padding, sizes + room)
     if room > 0.0:
@@ -111,19 +104,15 @@ def ignore_self(
     and the meshes of attached objects, without padding and scale. An unlabelled pixel sees the
     robot if its point is within `padding` and three standard deviations of the depth noise
     of a solid. Hidden space inside the solids is free; beside and behind them it stays hidden.
-
     A label of which nine tenths lie on the surface of the solids, within the noise, is the
     robot's and becomes 0. All others stay, and are obstacles.
 
     The collision spheres of a checker stand out of the solids, so in the shadow of its own
     links the pictured configuration is usually refused as "occluded". `room` is your word
-    that nothing is there: hidden space within the robot's collision spheres and `room` metres
-    around them is free, but not behind things that were seen in it or near it. Give the
-    robot that will be checked, with its padding and what it holds; the checker's margin and
-    twice the world's resolution are enough (0.02 by default).
-
-    Links without solids (spheres only, or a mesh file that is missing) are their collision
-    spheres, as `ignore_robot` has it; a warning names them.
+    that nothing is there: hidden space within the collision spheres (of the robot that will be
+    checked, with its padding and what it holds) and `room` metres around them is free, but not
+    behind things that were seen near it. The checker's margin and twice the world's resolution
+    are enough (0.02 by default).
 
     Args:
         observation: Posed in the world in which the robot's base stands, and labelled if it
@@ -131,13 +120,12 @@ def ignore_self(
         robot: A `Robot`; of anything else `sphere_centers(q)` (torch tensor (dof,) -> (S, 3),
             world, metres) and `sphere_radii` (S,) count.
         q: (dof,) radians or metres.
-        padding: Metres beyond the solids in which a pixel still sees the robot: the error of
-            the camera's pose, and of the URDF.
+        padding, remove_flying: See `ignore_robot`.
         room: Metres around the collision spheres, or None for no such word.
-        remove_flying: See `ignore_robot`.
 
     Returns:
-        The observation with `robot_spheres` set, and `warnings` of what is odd.
+        The observation with `robot_spheres` set, and `warnings` of what is odd: links without
+        solids (spheres only, or a mesh file that is missing) are their collision spheres.
 
     Raises:
         RobotError: q is not a configuration of the robot.
@@ -146,8 +134,8 @@ def ignore_self(
     """
     import torch
 
-    _check_metres("padding", padding)
-    _check_metres("room", 0.0 if room is None else room)
+    number("padding", padding, 0.0, unit="metres")
+    number("room", 0.0 if room is None else room, 0.0, unit="metres")
     if not observation.posed:
         raise ObservationError(
             "the observation has no T_world_camera, so the robot cannot be placed in it; give "
@@ -157,13 +145,12 @@ def ignore_self(
     if not hasattr(robot, "solid_balls"):
         return ignore_robot(
             observation, centers, robot.sphere_radii, padding,
-            room=room or 0.0, remove_flying=remove_flying,
+            room=room or 0.0, remove_flying=remove_flying
         )  # fmt: skip
     solid = robot.solid_balls(q)
     said: list[str] = []
-    marked = observation
-    if len(solid.spheres):
-        rows = solid.spheres
+    marked, rows = observation, solid.spheres
+    if len(rows):
         marked = _with_balls(marked, rows[:, :3], rows[:, 3] + padding, rows[:, 3])
         said.append(
             f"the links {list(solid.without)} have no solids that can be read, so their collision "
@@ -187,11 +174,6 @@ def ignore_self(
     return _finished(observation, marked, remove_flying)
 
 
-def _check_metres(name: str, value: float) -> None:
-    if not (np.isfinite(value) and value >= 0.0):
-        raise ConfigError(f"{name} is {value}; it must be 0 or more (metres)")
-
-
 def _in_camera(observation: Observation, places: Points) -> Points:
     return transform_points(invert_transform(observation.pose), places)
 
@@ -208,13 +190,7 @@ def _with_balls(
 
 
 def _without_own_labels(observation: Observation, inner: Balls, thick: Values) -> Observation:
-    """Take away the labels that are the robot's.
-
-    Args:
-        observation: what was seen.
-        inner: balls that fill the robot's solids, camera frame, metres.
-        thick: metres to either side that count as a solid's surface.
-    """
+    """Take away the labels that lie on balls of the robot (camera frame), within `thick`."""
     if observation.labels is None:
         return observation
     labels = observation.labels.copy()
@@ -230,24 +206,21 @@ def _without_own_labels(observation: Observation, inner: Balls, thick: Values) -
 def _objects(observation: Observation) -> list[tuple[int, Points]]:
     """Ids, and points in the camera frame, of the objects."""
     points = backproject(observation.depth, observation.intrinsics)
-    return [
-        (i, points[(observation.labels == i) & (observation.depth > 0)])
-        for i in observation.object_ids
-    ]
+    seen = observation.depth > 0
+    return [(i, points[(observation.labels == i) & seen]) for i in observation.object_ids]
 
 
 def _labels_on_robot(observation: Observation) -> list[str]:
     """Say which objects are seen in or on the robot."""
-    shares = [
-        (label, float(within_balls(own, observation.robot_spheres[:, :4]).mean()))
-        for label, own in _objects(observation)
-    ]
-    return [
-        f"{share:.0%} of object {label} is seen in or on the pictured robot, and it stays "
-        "an obstacle; if it is the robot or what that holds, set its label to 0"
-        for label, share in shares
-        if share > _MANY
-    ]
+    found = []
+    for label, own in _objects(observation):
+        share = float(within_balls(own, observation.robot_spheres[:, :4]).mean())
+        if share > _MANY:
+            found.append(
+                f"{share:.0%} of object {label} is seen in or on the pictured robot, and it stays "
+                "an obstacle; if it is the robot or what that holds, set its label to 0"
+            )
+    return found
 
 
 def _seen_through(observation: Observation, inner: Balls, tolerance: Values) -> list[str]:

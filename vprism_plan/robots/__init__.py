@@ -6,8 +6,7 @@ from vprism_plan.robots.kinematics import KinematicArrays
 from vprism_plan.robots.report import LinkReport, RobotReport
 from vprism_plan.robots.robot import Robot
 from vprism_plan.robots.sphere_files import read_spheres, write_spheres
-from vprism_plan.robots.sphere_fit import SphereFit, fit_spheres
-from vprism_plan.robots.spheres import enclosing_spheres
+from vprism_plan.robots.sphere_fit import SphereFit, enclosing_spheres, fit_spheres
 
 __all__ = [
     "KinematicArrays",

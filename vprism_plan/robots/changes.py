@@ -5,24 +5,22 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
 
+from vprism_plan._arguments import number, rigid_pose, whole
+from vprism_plan._shapes import Pairs, Points, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import read_triangles
 from vprism_plan.robots.kinematics import (
     Attachment,
     KinematicArrays,
-    TorchKinematics,
     bounding_ball,
     in_frame,
     only_links,
-    rigid_pose,
 )
 from vprism_plan.robots.pairs import NEVER, touching_pairs
 from vprism_plan.robots.sphere_fit import hold_object
@@ -64,62 +62,38 @@ def padded(
         disabled_pairs={p: why for p, why in robot.disabled_pairs.items() if p not in again},
         geometry=geometry,
         meshes=meshes,
-        _torch=TorchKinematics(arrays),
     )
 
 
-def _with_pairs(
-    arrays: KinematicArrays, added: Sequence[Sequence[int]]
-) -> Int[np.ndarray, "pairs 2"]:
+def _with_pairs(arrays: KinematicArrays, added: Sequence[Sequence[int]]) -> Pairs:
     """The pairs that are tested, with others added; sorted."""
     both = np.vstack([arrays.pairs, np.array(added, dtype=np.int64).reshape(-1, 2)])
     return np.ascontiguousarray(both[np.lexsort((both[:, 1], both[:, 0]))])
 
 
-def _per_link(
-    robot: Any, value: float | Mapping[str, float], default: float, what: str
-) -> Float[np.ndarray, "links"]:
-    """One number per link, from one for all or from a table of links and groups.
-
-    A link's own entry outranks that of a group; of several groups the largest value counts.
-    """
+def _per_link(robot: Any, value: Any, default: float, what: str) -> Values:
+    """One number per link, from one for all or from a table of links and groups."""
     names = robot.link_names
     if not isinstance(value, Mapping):
         return np.full(len(names), _allowed(value, what, "all links"))
     found: dict[str, float] = {}
     for name in sorted(value, key=lambda key: key in names):
-        number = _allowed(value[name], what, repr(name))
+        given = _allowed(value[name], what, repr(name))
         for link in robot.links_of(name):
             own = name in names or link not in found
-            found[link] = number if own else max(found[link], number)
+            found[link] = given if own else max(found[link], given)
     return np.array([found.get(name, default) for name in names], dtype=np.float64)
 
 
-def _allowed(value: float, what: str, whose: str) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise RobotError(f"{what} of {whose} is {value!r}; it must be a number") from error
-    if what == "padding" and not (math.isfinite(number) and number >= 0.0):
-        raise RobotError(
-            f"padding of {whose} is {value!r}; it must be finite metres, 0 or more (to shrink "
-            "links, use a scale below 1)"
-        )
-    if what == "scale" and not (math.isfinite(number) and number > 0.0):
-        raise RobotError(f"scale of {whose} is {value!r}; it must be finite and above 0")
-    return number
+def _allowed(value: Any, what: str, whose: str) -> float:
+    above = what == "scale"
+    return number(f"{what} of {whose}", value, 0.0, above=above, error=RobotError)
 
 
-def grown(
-    arrays: KinematicArrays,
-    scale: Float[np.ndarray, "links"],
-    padding: Float[np.ndarray, "links"],
-) -> KinematicArrays:
+def grown(arrays: KinematicArrays, scale: Values, padding: Values) -> KinematicArrays:
     """Scale the spheres of each link about the centre of its bounding ball, then pad them.
 
-    What was padding before is scaled like the rest and stays padding, in self-collision up
-    to its old size: the rest of what a scale above 1 makes of it counts as the link's.
-
+    What was padding is scaled like the rest and stays padding, up to its old size.
     A scale above 1 gives each sphere the smallest ball that holds it and its scaled image:
     a link with an elbow does not hold itself when it is only blown up from its middle.
     """
@@ -128,9 +102,8 @@ def grown(
     for link, (factor, pad) in enumerate(zip(scale, padding, strict=True)):
         rows = slice(int(arrays.link_start[link]), int(arrays.link_start[link + 1]))
         if factor != 1.0:
-            centers[rows], radii[rows] = _scaled(
-                centers[rows], radii[rows], arrays.link_center[link], float(factor)
-            )
+            about = arrays.link_center[link]
+            centers[rows], radii[rows] = _scaled(centers[rows], radii[rows], about, float(factor))
         radii[rows] += pad
         order = np.argsort(-radii[rows], kind="stable")
         centers[rows], radii[rows] = centers[rows][order], radii[rows][order]
@@ -139,18 +112,13 @@ def grown(
         arrays,
         sphere_center=np.ascontiguousarray(centers),
         sphere_radius=radii,
-        link_center=np.array([ball[0] for ball in balls]),
-        link_radius=np.array([ball[1] for ball in balls]),
+        link_center=np.array([center for center, _ in balls]),
+        link_radius=np.array([radius for _, radius in balls]),
         link_padding=np.minimum(scale, 1.0) * arrays.link_padding + padding,
     )
 
 
-def _scaled(
-    centers: Float[np.ndarray, "n 3"],
-    radii: Float[np.ndarray, "n"],
-    about: Float[np.ndarray, "3"],
-    factor: float,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+def _scaled(centers: Points, radii: Values, about: Vector, factor: float) -> tuple[Points, Values]:
     arm = centers - about
     image, big = about + factor * arm, factor * radii * (1.0 + 1e-12)
     if factor <= 1.0:
@@ -166,17 +134,12 @@ def _scaled(
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Shape of an attached object in its own frame, metres.
+    """Shape of an attached object in its own frame, metres: spheres that hold it, its mesh."""
 
-    Attributes:
-        spheres: rows (x, y, z, radius) that hold it.
-        surface: the triangles of its mesh, if one was given.
-    """
+    spheres: Spheres
+    surface: Triangles | None = None
 
-    spheres: Float[np.ndarray, "n 4"]
-    surface: Float[np.ndarray, "f 3 3"] | None = None
-
-    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+    def triangles(self) -> Triangles:
         """As of a link's `MeshFile`."""
         return np.empty((0, 3, 3)) if self.surface is None else self.surface
 
@@ -200,13 +163,15 @@ def attached(
         raise RobotError(f"{what}: no link {link!r}; links: {sorted(robot._links)}")
     if isinstance(touch_links, str):
         raise RobotError(f"{what}: touch_links is the string {touch_links!r}; give a sequence")
-    T = np.eye(4) if pose is None else rigid_pose(pose, f"{what}: pose")
+    T = rigid_pose(f"{what}: pose", np.eye(4) if pose is None else pose, error=RobotError)
     carrier = robot._links[link]
     sits = Attachment(carrier.frame, carrier.T @ T)
     siblings = [other for other, parent in robot.attached.items() if parent == link]
     reasons = dict.fromkeys(siblings, "Attached to the same link") | {link: "Attached"}
-    for touched in (member for entry in touch_links for member in _members(robot, entry)):
-        reasons.setdefault(touched, "Touch link")
+    for entry in touch_links:
+        members = (entry,) if entry in robot._links else robot.groups.get(entry)
+        for touched in robot.links_of(entry) if members is None else members:
+            reasons.setdefault(touched, "Touch link")
     tested = [i for i, other in enumerate(robot.link_names) if other not in reasons]
     arrays = _with_link(robot.arrays, sits, held.spheres, tested)
     names = (*robot.link_names, name)
@@ -226,7 +191,6 @@ def attached(
         attached=robot.attached | {name: link},
         held=robot.held | {name: held},
         _links=robot._links | {name: sits},
-        _torch=TorchKinematics(arrays),
     )
 
 
@@ -252,7 +216,6 @@ def detached(robot: Any, name: str) -> Any:
         attached={other: link for other, link in robot.attached.items() if other != name},
         held={other: shape for other, shape in robot.held.items() if other != name},
         _links={link: sits for link, sits in robot._links.items() if link != name},
-        _torch=TorchKinematics(arrays),
     )
 
 
@@ -261,24 +224,13 @@ def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
         raise RobotError(f"{what}: give either spheres or a mesh")
     if mesh is None:
         return Held(_sphere_rows(spheres, what))
-    if max_spheres < 1:
-        raise RobotError(f"{what}: max_spheres is {max_spheres}; it must be at least 1")
+    whole(f"{what}: max_spheres", max_spheres, 1, error=RobotError)
     triangles = read_triangles(mesh, what)
     return Held(hold_object(triangles, max_spheres), triangles)
 
 
-def _members(robot: Any, name: str) -> tuple[str, ...]:
-    """Links of a link or group, with or without spheres."""
-    if name in robot._links:
-        return (name,)
-    return tuple(robot.groups[name] if name in robot.groups else robot.links_of(name))
-
-
 def _with_link(
-    arrays: KinematicArrays,
-    sits: Attachment,
-    rows: Float[np.ndarray, "n 4"],
-    tested: Sequence[int],
+    arrays: KinematicArrays, sits: Attachment, rows: Spheres, tested: Sequence[int]
 ) -> KinematicArrays:
     """Add a link at the end: spheres in its own frame, to be tested against some links."""
     local, radii, center, radius = in_frame(sits, rows)
@@ -299,21 +251,16 @@ def _with_link(
     )
 
 
-def _sphere_rows(spheres: object, what: str) -> Float[np.ndarray, "n 4"]:
+def _sphere_rows(spheres: object, what: str) -> Spheres:
+    wanted = "give at least one row (x, y, z, radius) in metres"
     try:
         rows = np.array(spheres, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise RobotError(
-            f"{what}: spheres are not rows (x, y, z, radius) in metres: {error}"
-        ) from error
+        raise RobotError(f"{what}: spheres are no array of numbers: {error}; {wanted}") from error
     if rows.ndim != 2 or rows.shape[1] != 4 or len(rows) == 0:
-        raise RobotError(
-            f"{what}: spheres have shape {rows.shape}; give at least one row (x, y, z, radius)"
-        )
+        raise RobotError(f"{what}: spheres have shape {rows.shape}; {wanted}")
     bad = np.flatnonzero(~(np.isfinite(rows).all(axis=1) & (rows[:, 3] > 0.0)))
     if len(bad):
-        raise RobotError(
-            f"{what}: sphere {int(bad[0])} is {rows[bad[0]].tolist()}; centre and radius must be "
-            "finite and the radius positive (metres)"
-        )
+        found = f"{what}: sphere {int(bad[0])} is {rows[bad[0]].tolist()}"
+        raise RobotError(f"{found}; centre and radius must be finite and the radius positive")
     return rows

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from vprism_plan._files import reading
+from vprism_plan._shapes import Points, Pose, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.plain_xml import refuse_growing_scene
 
@@ -26,6 +26,7 @@ _MOST_TRIANGLES = 10_000_000
 _FORMATS = (".stl", ".obj", ".dae", ".ply", ".off", ".glb", ".gltf")
 # What rounding makes of triangles without any, as a share of the extent squared.
 _NO_AREA = 1e-12
+_REMEDY = "give a mesh file with a surface, or spheres= for the link"
 _logger = logging.getLogger(__name__)
 
 PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | None
@@ -34,30 +35,17 @@ PackageDirs = str | Path | Sequence[str | Path] | Mapping[str, str | Path] | Non
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """A mesh that a URDF names as collision geometry; read when it is needed.
+    """A mesh that a URDF names as collision geometry; read when it is needed."""
 
-    Attributes:
-        link: Whose geometry it is.
-        filename: As the URDF writes it.
-        scale: (3,) factors along the mesh's own axes.
-        T_link: (4, 4) pose in the link's frame.
-        path: The file, or None if there is none.
-        searched: Where it was looked for.
-    """
-
-    link: str
-    filename: str
-    scale: Float[np.ndarray, "3"]
-    T_link: Float[np.ndarray, "4 4"]
-    path: Path | None
-    searched: tuple[str, ...] = ()
+    link: str  # whose geometry it is
+    filename: str  # as the URDF writes it
+    scale: Vector  # factors along the mesh's own axes
+    T_link: Pose  # in the link's frame
+    path: Path | None  # the file, or None if there is none
+    searched: tuple[str, ...] = ()  # where it was looked for
 
     def require(self) -> Path:
-        """Return the file.
-
-        Raises:
-            RobotError: There is none; the message says where it was looked for.
-        """
+        """Return the file, or raise RobotError that says where it was looked for."""
         if self.path is None:
             raise RobotError(
                 f"link '{self.link}' has the mesh '{self.filename}' as collision geometry, and "
@@ -66,7 +54,7 @@ class MeshFile:
             )
         return self.path
 
-    def scaled(self, about: Float[np.ndarray, "3"], factor: float) -> MeshFile:
+    def scaled(self, about: Vector, factor: float) -> MeshFile:
         """The same mesh larger or smaller by a factor, about a point of the link's frame."""
         T = _moved(self.T_link, about, factor)
         return replace(self, scale=factor * self.scale, T_link=T)
@@ -75,8 +63,7 @@ class MeshFile:
         """The mesh as a ``trimesh.Trimesh`` in the link's frame, metres, vertices merged.
 
         Raises:
-            RobotError: See :meth:`require`; or the file cannot be read, holds no triangle
-                with an area, or is too large to be in metres.
+            RobotError: The file is missing, unreadable, without area, or too large for metres.
         """
         import trimesh
 
@@ -94,20 +81,16 @@ class MeshFile:
                 local.invert()
             extent = float(np.ptp(read_triangles(local, what, _LONGEST_LINK), axis=(0, 1)).max())
             if not local.area > _NO_AREA * extent**2:
-                raise RobotError(
-                    f"{what}: the mesh has no area, its triangles are lines or points; give a "
-                    "mesh file with a surface, or spheres= for the link"
-                )
+                found = "the mesh has no area, its triangles are lines or points"
+                raise RobotError(f"{what}: {found}; {_REMEDY}")
             return local
 
-    def triangles(self) -> Float[np.ndarray, "f 3 3"]:
+    def triangles(self) -> Triangles:
         """Triangles in the link's frame, metres; errors as of :meth:`mesh`."""
         return np.asarray(self.mesh().triangles, dtype=np.float64)
 
 
-def _moved(
-    T_link: Float[np.ndarray, "4 4"], about: Float[np.ndarray, "3"], factor: float
-) -> Float[np.ndarray, "4 4"]:
+def _moved(T_link: Pose, about: Vector, factor: float) -> Pose:
     T = T_link.copy()
     T[:3, 3] = about + factor * (T[:3, 3] - about)
     return T
@@ -119,10 +102,7 @@ def _loaded(path: Path, what: str) -> Any:
     units = scene.units if path.suffix.lower() == ".dae" else None
     mesh = scene.to_mesh()
     if len(mesh.faces) == 0:
-        raise RobotError(
-            f"{what}: '{path}' holds no triangles; give a mesh file with a surface, or spheres= "
-            "for the link"
-        )
+        raise RobotError(f"{what}: '{path}' holds no triangles; {_REMEDY}")
     if units not in (None, "meters"):
         import trimesh
 
@@ -137,9 +117,9 @@ def find_mesh(
 
     ``package://NAME/REST`` is looked for as ``package_dirs`` says, in ROS_PACKAGE_PATH and in
     AMENT_PREFIX_PATH (``share/NAME``), beside each folder above the URDF, and last as
-    ``REST`` below each of these folders (a checkout need not have the package's name): that
-    may be another package's file, so it is logged, and not done for a package that
-    ``package_dirs`` has. Other names are relative to the URDF's folder.
+    ``REST`` below each of these folders (a checkout need not have the package's name), which
+    is logged, and not done for a package that ``package_dirs`` has. Other names are relative
+    to the URDF's folder.
 
     Returns:
         The file or None, and the places where it was looked for.
@@ -207,18 +187,11 @@ class PrimitiveGeometry:
 
     kind: Literal["box", "cylinder", "sphere"]
     size: tuple[float, ...]
-    T_link: Float[np.ndarray, "4 4"]
+    T_link: Pose
     padding: float = 0.0
 
-    def signed_distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Exact signed distance of points to the solid.
-
-        Args:
-            points: (n, 3) positions in the link's frame, metres.
-
-        Returns:
-            (n,) metres, negative inside.
-        """
+    def signed_distance(self, points: Points) -> Values:
+        """Exact signed distance (metres, negative inside) of points in the link's frame."""
         local = (points - self.T_link[:3, 3]) @ self.T_link[:3, :3]
         if self.kind == "sphere":
             return np.linalg.norm(local, axis=1) - self.size[0] - self.padding
@@ -231,7 +204,7 @@ class PrimitiveGeometry:
         outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
         return outside + np.minimum(excess.max(axis=1), 0.0) - self.padding
 
-    def triangles(self, sides: int = 32) -> Float[np.ndarray, "f 3 3"]:
+    def triangles(self, sides: int = 32) -> Triangles:
         """A closed surface around the solid without its padding, link frame, metres.
 
         Exact for a box. A cylinder becomes a prism around it, a sphere a polyhedron around
@@ -255,9 +228,7 @@ class PrimitiveGeometry:
         local = np.asarray(mesh.triangles, dtype=np.float64)
         return local @ self.T_link[:3, :3].T + self.T_link[:3, 3]
 
-    def grown(
-        self, about: Float[np.ndarray, "3"], factor: float, padding: float
-    ) -> PrimitiveGeometry:
+    def grown(self, about: Vector, factor: float, padding: float) -> PrimitiveGeometry:
         """The solid scaled about a point of the link's frame, then padded."""
         T, size = _moved(self.T_link, about, factor), tuple(factor * edge for edge in self.size)
         return PrimitiveGeometry(self.kind, size, T, factor * self.padding + padding)
@@ -272,19 +243,13 @@ class PrimitiveGeometry:
 
 
 def read_scene(path: Path) -> Any:
-    """What a mesh file holds, as a ``trimesh.Scene``; call it inside of `reading`.
-
-    Raises:
-        RobotError: Another format, or more triangles than any link has. Else whatever the
-            format's reader raises.
-    """
+    """What a mesh file holds, as a ``trimesh.Scene``; call it inside of `reading`."""
     import trimesh
 
     format = path.suffix.lower()
     if format not in _FORMATS:
-        raise RobotError(
-            f"'{path}' is a mesh of format {format!r}; formats that are read: {', '.join(_FORMATS)}"
-        )
+        valid = f"formats that are read: {', '.join(_FORMATS)}"
+        raise RobotError(f"'{path}' is a mesh of format {format!r}; {valid}")
     if format == ".dae":
         refuse_growing_scene(path)
     # Processing would cut out vertices that are not finite, and their faces, in silence.
@@ -296,9 +261,7 @@ def read_scene(path: Path) -> Any:
     return scene
 
 
-def read_triangles(
-    mesh: Any, what: str, max_extent: float = _LONGEST_OBJECT
-) -> Float[np.ndarray, "f 3 3"]:
+def read_triangles(mesh: Any, what: str, max_extent: float = _LONGEST_OBJECT) -> Triangles:
     """Triangles of a mesh or of a mesh file, metres.
 
     Raises:

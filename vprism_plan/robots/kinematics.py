@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 
 from vprism_plan._read_only import make_read_only
+from vprism_plan._shapes import Configurations, Indices, Points, Pose, Spheres, Values, Vector
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.sphere_files import LinkSpheres
 from vprism_plan.robots.urdf import RobotModel
@@ -39,31 +39,26 @@ class KinematicArrays:
     with ``T_0 = [base_R, base_t]``. Metres and radians.
 
     Attributes:
-        base_R: Rotation of the base in the world.
-        base_t: Position of the base in the world, metres.
+        base_R, base_t: Rotation and position of the base in the world.
         parent: Parent frame, -1 for frame 0.
-        R_off: Joint frame in its parent frame at joint value 0, rotation.
-        t_off: The same, translation in metres.
+        R_off, t_off: Joint frame in its parent frame at joint value 0.
         axis: Unit joint axis in the joint frame.
         kind: 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic.
         q_index: Index into the configuration, -1 for frame 0.
-        q_mult: Factor on the configuration value (1 unless the joint mimics).
-        q_offset: Offset added to it (0 unless the joint mimics).
+        q_mult, q_offset: Factor on the configuration value and what is added to it (1 and 0
+            unless the joint mimics).
         sphere_frame: Frame each sphere moves with.
-        sphere_center: Centre in that frame, metres.
-        sphere_radius: Radius, metres. Spheres are sorted by (link, radius
-            falling), so the spheres of a link are contiguous.
+        sphere_center: Centre in that frame.
+        sphere_radius: Radius. Spheres are sorted by link, and in it by falling radius.
         sphere_link: Index into the robot's ``link_names``.
         link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
         link_frame: Frame each link moves with.
-        link_center: Centre of a ball that holds all spheres of the link.
-        link_radius: Radius of that ball.
+        link_center, link_radius: A ball that holds all spheres of the link.
         link_fixed: True where no joint moves the link.
         link_padding: Metres of each link's radii that are padding. They count against the
             world; a pair's gap is that of its spheres plus the padding of both links.
         pairs: Link pairs (first < second) to test for self-collision.
-        lower: Lower joint limits; -pi for continuous joints.
-        upper: Upper joint limits; +pi for continuous joints.
+        lower, upper: Joint limits; -pi and pi for continuous joints.
         continuous: True where the joint turns without limit.
     """
 
@@ -110,7 +105,7 @@ class Attachment:
 
 
 def rotation(
-    axis: Float[np.ndarray, "3"], angle: Float[np.ndarray, "*batch"] | np.float64
+    axis: Vector, angle: Float[np.ndarray, "*batch"] | np.float64
 ) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices about a unit axis (Rodrigues)."""
     x, y, z = axis
@@ -124,12 +119,11 @@ def build_arrays(
     active: Sequence[str],
     locked: Mapping[str, float],
     spheres: LinkSpheres,
-    base_pose: Float[np.ndarray, "4 4"],
+    base_pose: Pose,
 ) -> tuple[KinematicArrays, dict[str, Attachment]]:
     """Flatten a robot into arrays without pairs, and say where each URDF link sits.
 
-    Every other actuated joint than the active ones is locked at its value. The links with
-    spheres are numbered in their order in ``spheres``.
+    Actuated joints that are not active are locked. Links are numbered as in ``spheres``.
     """
     frames: list[tuple[int, np.ndarray, np.ndarray, int, int, float, float]] = [
         (-1, np.eye(4), np.array([0.0, 0.0, 1.0]), KIND_FIXED, -1, 0.0, 0.0)
@@ -155,72 +149,52 @@ def build_arrays(
                 motion[:3, :3] = rotation(joint.axis, value)
             links[joint.child] = Attachment(parent.frame, T @ motion)
     chosen = [model.joint_map[name] for name in active]
-    offsets = np.array([frame[1] for frame in frames])
+    centers, radii, ball_centers, ball_radii = zip(
+        *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
+    )
+    counts = [len(rows) for rows in radii]
+    link_frame = np.array([links[name].frame for name in spheres])
+    parents, offsets, axes, kinds, drivers, factors, shifts = (
+        np.array(column) for column in zip(*frames, strict=True)
+    )
     arrays = KinematicArrays(
-        base_R=_floats(base_pose[:3, :3]),
-        base_t=_floats(base_pose[:3, 3]),
-        parent=_ints([frame[0] for frame in frames]),
-        R_off=_floats(offsets[:, :3, :3]),
-        t_off=_floats(offsets[:, :3, 3]),
-        axis=_floats([frame[2] for frame in frames]),
-        kind=_ints([frame[3] for frame in frames]),
-        q_index=_ints([frame[4] for frame in frames]),
-        q_mult=_floats([frame[5] for frame in frames]),
-        q_offset=_floats([frame[6] for frame in frames]),
-        **_sphere_arrays(spheres, links),
+        base_R=base_pose[:3, :3].copy(),
+        base_t=base_pose[:3, 3].copy(),
+        parent=parents,
+        R_off=offsets[:, :3, :3].copy(),
+        t_off=offsets[:, :3, 3].copy(),
+        axis=axes,
+        kind=kinds,
+        q_index=drivers,
+        q_mult=factors,
+        q_offset=shifts,
+        sphere_frame=np.repeat(link_frame, counts),
+        sphere_center=np.vstack(centers),
+        sphere_radius=np.concatenate(radii),
+        sphere_link=np.repeat(np.arange(len(counts)), counts),
+        link_start=np.array([0, *np.cumsum(counts)]),
+        link_frame=link_frame,
+        link_center=np.array(ball_centers),
+        link_radius=np.array(ball_radii),
+        link_fixed=link_frame == 0,
+        link_padding=np.zeros(len(link_frame)),
         pairs=np.empty((0, 2), dtype=np.int64),
-        lower=_floats([joint.lower for joint in chosen]),
-        upper=_floats([joint.upper for joint in chosen]),
-        continuous=np.array([joint.kind == "continuous" for joint in chosen], dtype=bool),
+        lower=np.array([joint.lower for joint in chosen]),
+        upper=np.array([joint.upper for joint in chosen]),
+        continuous=np.array([joint.kind == "continuous" for joint in chosen]),
     )
     return arrays, links
 
 
-def _floats(values: object) -> np.ndarray:
-    return np.array(values, dtype=np.float64, order="C")
-
-
-def _ints(values: object) -> np.ndarray:
-    return np.array(values, dtype=np.int64, order="C")
-
-
-def in_frame(
-    sits: Attachment, rows: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"], Float[np.ndarray, "3"], float]:
+def in_frame(sits: Attachment, rows: Spheres) -> tuple[Points, Values, Vector, float]:
     """A link's spheres in the frame that it moves with, radius falling, and a ball around them."""
     rows = rows[np.argsort(-rows[:, 3], kind="stable")]
     local = rows[:, :3] @ sits.T[:3, :3].T + sits.T[:3, 3]
     return local, rows[:, 3], *bounding_ball(local, rows[:, 3])
 
 
-def _sphere_arrays(spheres: LinkSpheres, links: Mapping[str, Attachment]) -> dict[str, np.ndarray]:
-    centers, radii, ball_centers, ball_radii = zip(
-        *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
-    )
-    counts = [len(rows) for rows in radii]
-    link_frame = _ints([links[name].frame for name in spheres])
-    return {
-        "sphere_frame": np.repeat(link_frame, counts),
-        "sphere_center": _floats(np.vstack(centers)),
-        "sphere_radius": _floats(np.concatenate(radii)),
-        "sphere_link": np.repeat(np.arange(len(counts)), counts),
-        "link_start": _ints([0, *np.cumsum(counts)]),
-        "link_frame": link_frame,
-        "link_center": _floats(ball_centers),
-        "link_radius": _floats(ball_radii),
-        "link_fixed": link_frame == 0,
-        "link_padding": np.zeros(len(link_frame)),
-    }
-
-
-def bounding_ball(
-    centers: Float[np.ndarray, "n 3"], radii: Float[np.ndarray, "n"]
-) -> tuple[Float[np.ndarray, "3"], float]:
-    """A small ball that holds a set of balls (Badoiu and Clarkson's iteration).
-
-    Returns:
-        Centre, and a radius rounded up so that every ball is held.
-    """
+def bounding_ball(centers: Points, radii: Values) -> tuple[Vector, float]:
+    """Centre and radius (rounded up) of a small ball that holds balls (Badoiu and Clarkson)."""
     center = centers.mean(axis=0)
     best, radius = center, np.inf
     for step in range(1, 200):
@@ -237,10 +211,9 @@ def bounding_ball(
 
 
 def frame_poses(
-    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"]
+    arrays: KinematicArrays, q: Configurations
 ) -> tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]]:
-    """World poses of all frames for a batch of configurations (radians or metres): rotations
-    and positions."""
+    """World rotations and positions of all frames for configurations (radians or metres)."""
     n, count = len(q), len(arrays.parent)
     R, t = np.empty((n, count, 3, 3)), np.empty((n, count, 3))
     R[:, 0], t[:, 0] = arrays.base_R, arrays.base_t
@@ -258,15 +231,15 @@ def frame_poses(
 
 def place(
     poses: tuple[Float[np.ndarray, "n frames 3 3"], Float[np.ndarray, "n frames 3"]],
-    frame: Int[np.ndarray, "m"],
-    points: Float[np.ndarray, "m 3"],
+    frame: Indices,
+    points: Points,
 ) -> Float[np.ndarray, "n m 3"]:
     """World positions of points that move with frames, from :func:`frame_poses`."""
     R, t = poses
     return np.asarray((R[:, frame] @ points[:, :, None])[..., 0] + t[:, frame])
 
 
-def only_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+def only_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
     """Spheres of these links only, in this order; all joints, and no pairs."""
     counts = np.diff(arrays.link_start)[links]
     starts = np.concatenate([[0], np.cumsum(counts)])
@@ -284,11 +257,7 @@ def only_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> Kinemati
 
 
 def reach_bound(arrays: KinematicArrays) -> float:
-    """No sphere reaches farther from the base origin than this, metres.
-
-    The sum of offsets along each branch, plus the travel of its prismatic joints,
-    plus how far the spheres stand off their frame: the triangle inequality.
-    """
+    """No sphere reaches farther from the base origin than this (metres; triangle inequality)."""
     reach = np.zeros(len(arrays.parent))
     for f in range(1, len(reach)):
         reach[f] = reach[arrays.parent[f]] + np.linalg.norm(arrays.t_off[f])
@@ -302,9 +271,8 @@ def reach_bound(arrays: KinematicArrays) -> float:
 class TorchKinematics:
     """Sphere centres in the base frame as a function of a torch configuration.
 
-    The chain of pytorch-kinematics is built from float64 matrices, not from URDF text: its
-    reader rounds offsets to float32, ignores mimic joints and gives continuous joints with an
-    effort limit the range (0, 0). One chain is kept per dtype and device.
+    The chain of pytorch-kinematics is built from our matrices, as its reader of URDFs rounds to
+    float32 and ignores mimic joints. One is kept per dtype and device.
     """
 
     def __init__(self, arrays: KinematicArrays) -> None:
@@ -333,8 +301,7 @@ class TorchKinematics:
 def _torch_chain(
     arrays: KinematicArrays, dtype: torch.dtype, device: torch.device
 ) -> tuple[Any, ...]:
-    """The frames as a pytorch-kinematics chain, joint and frame f being "j<f>", "f<f>"; and, in
-    its order, index, factor and offset of each joint's value; each sphere's frame and centre."""
+    """A chain; index, factor and offset of its joints; frames and centres of the spheres."""
     import torch
     from pytorch_kinematics.chain import Chain
     from pytorch_kinematics.frame import Frame, Joint
@@ -376,12 +343,11 @@ def _torch_chain(
 def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
     """Return joint values as a fresh float64 array, C-contiguous and writeable.
 
-    A copy even of what is such an array: numba would compile its kernels once more for a
-    read-only one. Neither the shape nor that values are finite is looked at.
+    A copy in any case: numba would compile its kernels once more for a read-only array.
 
     Raises:
         RobotError: they are not real numbers, ragged, too large for a float, masked, or a
-            tensor that requires a gradient.
+            tensor that requires a gradient. Shape and finiteness are not looked at.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values.copy(order="C")
@@ -397,24 +363,3 @@ def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]
             f"{what} cannot be read from {type(values).__name__}: {error}; give "
             f"real numbers for the {robot.dof} joints {list(robot.joint_names)}"
         ) from error
-
-
-def rigid_pose(pose: ArrayLike, what: str = "base_pose") -> Float[np.ndarray, "4 4"]:
-    """A copy of a pose, refused unless it is a proper rigid motion."""
-    try:
-        T = np.array(pose, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RobotError(f"{what} is not a (4, 4) array: {error}") from error
-    if T.shape != (4, 4):
-        raise RobotError(f"{what} has shape {T.shape}; expected (4, 4)")
-    if not np.isfinite(T).all():
-        raise RobotError(f"{what} holds NaN or infinite values; give a rigid 4x4 pose")
-    R = T[:3, :3]
-    drift = float(np.abs(R @ R.T - np.eye(3)).max())
-    if drift > 1e-6 or np.linalg.det(R) < 0 or not np.array_equal(T[3], [0, 0, 0, 1]):
-        raise RobotError(
-            f"{what} is not rigid: its rotation is off orthonormal by {drift:.3g}, with "
-            f"determinant {np.linalg.det(R):.6g} (expected 1) and last row {T[3].tolist()} "
-            "(expected [0, 0, 0, 1])"
-        )
-    return T

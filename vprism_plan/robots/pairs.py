@@ -9,14 +9,17 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from numpy.random import Generator
 
+from vprism_plan._arguments import whole
+from vprism_plan._shapes import Configurations, Indices, Pairs, Values
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
-from vprism_plan.robots.spheres import ChosenSpheres
+from vprism_plan.robots.sphere_files import ChosenSpheres
 from vprism_plan.robots.srdf import RIGID
 from vprism_plan.robots.urdf import RobotModel
 
+Reasons = dict[frozenset[str], str]  # unordered pair of links -> why it is not tested
 ADJACENT, ALWAYS, NEVER = "Adjacent", "Always", "Never"
 SAMPLES = 10_000
 # "Never" asks for so much room in every sample, metres, and after a search for less.
@@ -33,20 +36,18 @@ def choose_pairs(
     chosen: ChosenSpheres,
     stated: Mapping[frozenset[str], str] | None,
     samples: int,
-) -> tuple[Int[np.ndarray, "pairs 2"], dict[frozenset[str], str], dict[frozenset[str], str]]:
+) -> tuple[Pairs, Reasons, Reasons]:
     """Which pairs of links are tested: all but adjacent, rigid and disabled ones, and those that
     random configurations show to need no test.
 
     Args:
-        model: The tree.
-        arrays: The robot.
-        chosen: Its spheres.
+        model, arrays, chosen: The robot, and its spheres.
         stated: The pairs that an SRDF disables; None where there is no SRDF.
         samples: Random configurations, where there is none.
 
     Returns:
-        (P, 2) indices into the links with spheres, first < second, sorted; all other pairs,
-        with the reasons; and of these the ones that random configurations showed.
+        The tested pairs, first < second, sorted; all others with the reasons; and of these the
+        ones that random configurations showed.
     """
     names = tuple(chosen.rows)
     everything = list(combinations(range(len(names)), 2))
@@ -61,8 +62,7 @@ def choose_pairs(
     if stated is not None:
         sampled = _touching_fits(arrays, pairs, chosen)
     else:
-        if samples < 1:
-            raise RobotError(f"matrix_samples is {samples}; at least 1 configuration is needed")
+        whole("matrix_samples", samples, 1, error=RobotError)
         sampled = sampled_reasons(arrays, pairs, names, samples)
         always = [tuple(sorted(pair)) for pair, why in sampled.items() if why == ALWAYS]
         if always:
@@ -86,9 +86,7 @@ def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
     return pairs
 
 
-def _touching_fits(
-    arrays: KinematicArrays, pairs: Int[np.ndarray, "pairs 2"], chosen: ChosenSpheres
-) -> dict[frozenset[str], str]:
+def _touching_fits(arrays: KinematicArrays, pairs: Pairs, chosen: ChosenSpheres) -> Reasons:
     """Pairs that an SRDF wants tested, and whose fitted spheres overlap in every pose."""
     names = tuple(chosen.rows)
     made = np.array([chosen.sources[name] in ("fitted", "tiled") for name in names])
@@ -117,19 +115,14 @@ def hangs_on(model: RobotModel, joints: Collection[str], pair: frozenset[str]) -
 
 
 def sampled_reasons(
-    arrays: KinematicArrays,
-    pairs: Int[np.ndarray, "pairs 2"],
-    names: Sequence[str],
-    samples: int,
-) -> dict[frozenset[str], str]:
+    arrays: KinematicArrays, pairs: Pairs, names: Sequence[str], samples: int
+) -> Reasons:
     """Pairs that overlap always, and pairs that never come near each other.
 
-    "Always": the spheres overlap at the joints' zero and in every random configuration. The
-    pair does so because of how the links are built, or of how coarse the spheres are;
-    testing it would refuse every pose. "Never": the spheres are 5 cm apart in every one, and
-    stay so when the joints are moved downhill from the nearest. A sample proves neither:
-    a pair that comes near in a corner of the joint space only can be missed, so what is in
-    between, and what was nearer just once, stays tested.
+    "Always": the spheres overlap at the joints' zero and in every random configuration, because
+    of how the links are built or how coarse the spheres are; testing it would refuse every
+    pose. "Never": the spheres are 5 cm apart in every one, and stay so when the joints are moved
+    downhill from the nearest. A sample proves neither, so what is in between stays tested.
     """
     rng = np.random.default_rng(0)
     q = _zero_and_random(arrays, samples - 1, rng)
@@ -154,17 +147,11 @@ def sampled_reasons(
     return _named(pairs[always], names, ALWAYS) | _named(pairs[far], names, NEVER)
 
 
-def _named(
-    pairs: Int[np.ndarray, "pairs 2"], names: Sequence[str], reason: str
-) -> dict[frozenset[str], str]:
+def _named(pairs: Pairs, names: Sequence[str], reason: str) -> Reasons:
     return {frozenset((names[a], names[b])): reason for a, b in pairs}
 
 
-def pair_gaps(
-    arrays: KinematicArrays,
-    q: Float[np.ndarray, "n dof"],
-    pairs: Int[np.ndarray, "pairs 2"],
-) -> Float[np.ndarray, "n pairs"]:
+def pair_gaps(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.ndarray:
     """Distance between the spheres of two links in each configuration, padding not counted.
 
     Beyond :data:`ROOM` it is a lower bound: that of the balls around the links' spheres.
@@ -185,11 +172,8 @@ def pair_gaps(
 
 
 def _least_gaps(
-    arrays: KinematicArrays,
-    starts: Float[np.ndarray, "pairs starts dof"],
-    pairs: Int[np.ndarray, "pairs 2"],
-    rng: np.random.Generator,
-) -> Float[np.ndarray, "pairs"]:
+    arrays: KinematicArrays, starts: np.ndarray, pairs: Pairs, rng: Generator
+) -> Values:
     """The smallest gaps that random steps downhill from these configurations lead to."""
     span, least = arrays.upper - arrays.lower, np.full(len(pairs), np.inf)
     both = np.array([[0, 1]])
@@ -208,7 +192,7 @@ def _least_gaps(
     return least
 
 
-def _of_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> KinematicArrays:
+def _of_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
     """Only these links, in this order, and the joints that move them; q stays as it was."""
     frames: set[int] = {0}
     for link in links:
@@ -232,16 +216,13 @@ def _of_links(arrays: KinematicArrays, links: Int[np.ndarray, "n"]) -> Kinematic
     )
 
 
-def pairs_touching(
-    arrays: KinematicArrays, q: Float[np.ndarray, "n dof"], pairs: Int[np.ndarray, "pairs 2"]
-) -> Bool[np.ndarray, "n pairs"]:
-    """For each configuration and link pair, whether any of their spheres overlap, padding
-    not counted."""
+def pairs_touching(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.ndarray:
+    """Whether any spheres of each pair overlap in each configuration, padding not counted."""
     return pair_gaps(arrays, q, pairs) < 0.0
 
 
 def touching_pairs(
-    arrays: KinematicArrays, q: Float[np.ndarray, "dof"], names: Sequence[str]
+    arrays: KinematicArrays, q: Values, names: Sequence[str]
 ) -> set[tuple[str, str]]:
     """Names of the tested pairs whose spheres overlap at one configuration."""
     touching = pairs_touching(arrays, q[None], arrays.pairs)[0]
@@ -254,22 +235,16 @@ def touching_shares(
     """See :meth:`Robot.touching_shares`."""
     q = random_configurations(arrays, samples, np.random.default_rng(seed))
     shares = pairs_touching(arrays, q, arrays.pairs).mean(axis=0)
-    return {
-        frozenset((names[a], names[b])): float(share)
-        for (a, b), share in zip(arrays.pairs, shares, strict=True)
-    }
+    pairs = [frozenset((names[a], names[b])) for a, b in arrays.pairs]
+    return dict(zip(pairs, shares.tolist(), strict=True))
 
 
-def random_configurations(
-    arrays: KinematicArrays, n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "n dof"]:
+def random_configurations(arrays: KinematicArrays, n: int, rng: Generator) -> Configurations:
     """Uniform configurations within the limits."""
     return rng.uniform(arrays.lower, arrays.upper, size=(n, len(arrays.lower)))
 
 
-def _zero_and_random(
-    arrays: KinematicArrays, n: int, rng: np.random.Generator
-) -> Float[np.ndarray, "m dof"]:
+def _zero_and_random(arrays: KinematicArrays, n: int, rng: Generator) -> Configurations:
     """The joints' zero, or the limit next to it, and n random configurations."""
     at_zero = np.clip(np.zeros(len(arrays.lower)), arrays.lower, arrays.upper)
     return np.vstack([at_zero, random_configurations(arrays, n, rng)])

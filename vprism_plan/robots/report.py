@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
+from vprism_plan._shapes import Points, Spheres, Triangles, Values
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.surfaces import (
     Surface,
     halved_triangles,
@@ -88,9 +88,7 @@ class RobotReport:
 
     @property
     def enclosed(self) -> bool | None:
-        """Whether all links are proved to be enclosed; None where a link's mesh is missing, and
-        where no link has geometry to compare with.
-        """
+        """Whether all links are proved to be enclosed; None where no link or mesh is known."""
         known = [link.enclosed for link in self.links if link.geometry]
         return False if False in known else True if known and None not in known else None
 
@@ -104,14 +102,12 @@ class RobotReport:
         header = ("link", "spheres", "from", "enclosed", "coverage", "stands out", "mean")
         rows = [header, *map(_row, self.links)]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = []
-        for row in rows:
-            cells = (
-                cell.rjust(width) if c in (1, 4, 5, 6) else cell.ljust(width)
-                for c, (cell, width) in enumerate(zip(row, widths, strict=True))
-            )
-            lines.append("  ".join(cells).rstrip())
-        return "\n".join(lines)
+        aligned = (str.ljust, str.rjust, str.ljust, str.ljust, str.rjust, str.rjust, str.rjust)
+        lines = (
+            "  ".join(a(cell, w) for a, cell, w in zip(aligned, row, widths, strict=True))
+            for row in rows
+        )
+        return "\n".join(line.rstrip() for line in lines)
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
@@ -120,8 +116,8 @@ class RobotReport:
 
 
 def _row(link: LinkReport) -> tuple[str, ...]:
-    def millimetres(value: float | None) -> str:
-        return "-" if value is None else f"{1000.0 * value:.1f} mm"
+    def text(value: float | None, factor: float, unit: str) -> str:
+        return "-" if value is None else f"{factor * value:.1f} {unit}"
 
     if link.unchecked:
         verdict = "NOT CHECKED"
@@ -129,15 +125,9 @@ def _row(link: LinkReport) -> tuple[str, ...]:
         verdict = "mesh missing" if link.missing else "no geometry"
     else:
         verdict = "proved" if link.enclosed else f"no, {1000.0 * (link.bare or 0.0):.1f} mm bare"
-    return (
-        link.link,
-        str(link.spheres),
-        link.source,
-        verdict,
-        "-" if link.coverage is None else f"{100.0 * link.coverage:.1f} %",
-        millimetres(link.protrusion),
-        millimetres(link.mean_protrusion),
-    )
+    lengths = (text(value, 1000.0, "mm") for value in (link.protrusion, link.mean_protrusion))
+    coverage = text(link.coverage, 100.0, "%")
+    return link.link, str(link.spheres), link.source, verdict, coverage, *lengths
 
 
 def robot_report(robot: Any) -> RobotReport:
@@ -153,9 +143,7 @@ def robot_report(robot: Any) -> RobotReport:
     )
 
 
-def _of_link(
-    robot: Any, name: str
-) -> tuple[tuple[PrimitiveGeometry, ...], tuple[MeshFile, ...], np.ndarray]:
+def _of_link(robot: Any, name: str) -> tuple[tuple, tuple, np.ndarray]:
     """Its solids, its meshes and its spheres, as they were read."""
     solids, meshes = robot.geometry_as_read.get(name, ()), robot.meshes_as_read.get(name, ())
     return solids, meshes, robot.link_spheres.get(name, np.empty((0, 4)))
@@ -202,8 +190,7 @@ def _link_report(robot: Any, name: str) -> LinkReport:
         return replace(stated, enclosed=False, coverage=0.0)
     if missing or not (solids or meshes):
         return stated
-    held = [solid for solid in solids if solid.kind == "sphere" and _in_one(solid, rows)]
-    rest = [solid for solid in solids if solid not in held]
+    rest = [solid for solid in solids if solid.kind != "sphere" or not _in_one(solid, rows)]
     surface = link_triangles(rest, meshes, _SIDES)
     gap = sphere_gap(surface_samples(surface), rows)
     worst, mean = protrusion(solids, link_triangles((), meshes) if meshes else None, rows)
@@ -222,19 +209,15 @@ def _in_one(solid: PrimitiveGeometry, rows: np.ndarray) -> bool:
     return bool((away + solid.size[0] <= rows[:, 3] * (1.0 + 1e-12)).any())
 
 
-# Where a triangle's edges are shorter than this and it still is in no single sphere, the
-# surface counts as bare, metres.
-_FINEST = 2e-6
-_ON_SPHERE = 200
-_ROWS = 20_000
+_FINEST = 2e-6  # metres: a triangle with shorter edges that is in no single sphere is bare
+_ON_SPHERE, _ROWS = 200, 20_000
 
 
-def enclosed(triangles: Float[np.ndarray, "f 3 3"], spheres: Float[np.ndarray, "n 4"]) -> bool:
+def enclosed(triangles: Triangles, spheres: Spheres) -> bool:
     """Whether every point of a surface lies in the union of spheres: a proof, no sampling.
 
     A triangle whose corners lie in one sphere lies in it. Others are halved, until all do
-    (proved) or a corner lies in none (refuted). A surface that touches the union's edge from
-    inside, to within a few thousandths of a millimetre, counts as bare.
+    (proved) or a corner lies in none (refuted), or nearly so.
     """
     waiting = [triangles[i : i + _ROWS] for i in range(0, len(triangles), _ROWS)]
     while waiting:
@@ -254,9 +237,7 @@ def enclosed(triangles: Float[np.ndarray, "f 3 3"], spheres: Float[np.ndarray, "
     return True
 
 
-def sphere_gap(
-    points: Float[np.ndarray, "n 3"], spheres: Float[np.ndarray, "m 4"]
-) -> Float[np.ndarray, "n"]:
+def sphere_gap(points: Points, spheres: Spheres) -> Values:
     """Signed distance of points to the union of spheres, metres: negative inside."""
     gap = np.full(len(points), math.inf)
     for *centre, radius in spheres:
@@ -265,18 +246,20 @@ def sphere_gap(
 
 
 def protrusion(
-    primitives: Sequence[PrimitiveGeometry],
-    triangles: Float[np.ndarray, "f 3 3"] | None,
-    spheres: Float[np.ndarray, "n 4"],
+    primitives: Sequence[PrimitiveGeometry], triangles: Triangles | None, spheres: Spheres
 ) -> tuple[float, float]:
     """How far the union of spheres stands out of a link at most, and on average, metres.
 
     Measured at 200 points of each sphere that lie in no other: their distance to the link, 0
-    inside it (an open shell is solid up to its convex hull). To a mesh the distance is taken
-    to points of it so dense that it is too large by half a millimetre at most where it is two
-    centimetres or more.
+    inside it (an open shell is solid up to its convex hull). To a mesh it is taken to points,
+    and too large by half a millimetre at most from two centimetres on.
     """
-    points = _outer_points(spheres)
+    i = np.arange(_ON_SPHERE) + 0.5
+    height, turn = 1.0 - 2.0 * i / _ON_SPHERE, math.pi * (1.0 + math.sqrt(5.0)) * i
+    rim = np.sqrt(1.0 - height**2)
+    unit = np.stack([rim * np.cos(turn), rim * np.sin(turn), height], axis=1)
+    points = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
+    points = points[sphere_gap(points, spheres) > -1e-9]
     if len(points) == 0:
         return 0.0, 0.0
     away = np.full(len(points), math.inf)
@@ -288,19 +271,7 @@ def protrusion(
     return float(away.max()), float(away.mean())
 
 
-def _outer_points(spheres: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
-    """Points of the union's surface."""
-    i = np.arange(_ON_SPHERE) + 0.5
-    height, turn = 1.0 - 2.0 * i / _ON_SPHERE, math.pi * (1.0 + math.sqrt(5.0)) * i
-    rim = np.sqrt(1.0 - height**2)
-    unit = np.stack([rim * np.cos(turn), rim * np.sin(turn), height], axis=1)
-    points = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
-    return points[sphere_gap(points, spheres) > -1e-9]
-
-
-def _mesh_distance(
-    triangles: Float[np.ndarray, "f 3 3"], points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n"]:
+def _mesh_distance(triangles: Triangles, points: Points) -> Values:
     """Distance to a surface, 0 where the surface encloses the point."""
     from scipy.spatial import cKDTree
 

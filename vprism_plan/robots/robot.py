@@ -10,37 +10,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from vprism_plan._arguments import rigid_pose
 from vprism_plan._read_only import make_read_only
+from vprism_plan._shapes import Pairs, Pose
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import changes, pairs, solid_balls
+from vprism_plan.robots import changes, kinematics, pairs, surfaces
 from vprism_plan.robots.changes import Held
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
-from vprism_plan.robots.kinematics import (
-    Attachment,
-    KinematicArrays,
-    TorchKinematics,
-    build_arrays,
-    frame_poses,
-    joint_values,
-    reach_bound,
-    rigid_pose,
-)
+from vprism_plan.robots.kinematics import Attachment, KinematicArrays, TorchKinematics
 from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
-from vprism_plan.robots.solid_balls import SolidBalls
-from vprism_plan.robots.sphere_files import write_spheres
+from vprism_plan.robots.sphere_files import link_spheres, write_spheres
 from vprism_plan.robots.sphere_fit import SphereFit
-from vprism_plan.robots.spheres import link_spheres
 from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, lock_values, write_srdf
 from vprism_plan.robots.urdf import load_model
-
-if TYPE_CHECKING:
-    pass
 
 READY = "ready"
 _logger = logging.getLogger(__name__)
@@ -50,9 +38,8 @@ _logger = logging.getLogger(__name__)
 class Robot:
     """A robot read from a URDF; build it with :meth:`from_urdf`.
 
-    A configuration ``q`` has one value per name in ``joint_names``: radians for
-    revolute and continuous joints, metres for prismatic ones. Its arrays are read-only; copy
-    what is to be changed.
+    A configuration ``q`` has one value per name in ``joint_names``: radians for revolute and
+    continuous joints, metres for prismatic ones. Arrays are read-only.
 
     Attributes:
         name: The robot's name.
@@ -65,10 +52,10 @@ class Robot:
         named_states: SRDF states that fix every joint of ``joint_names``.
         groups: SRDF group -> names of its links: the children of its joints and the links
             it names, with or without spheres (:meth:`links_of` gives those with spheres).
-        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's; with
-            an SRDF or without, "Adjacent" for links joined by a joint (also through links
-            without spheres) and "Rigid" for links that no joint moves against each other;
-            "Always" and "Never" of random configurations; or what :meth:`attach` was told.
+        disabled_pairs: Unordered link pair -> the reason for not testing it: the SRDF's;
+            "Adjacent" for links joined by a joint (also through links without spheres);
+            "Rigid" for links that no joint moves against each other; "Always" and "Never" of
+            random configurations; or what :meth:`attach` says.
         arrays: The flat form that compiled kernels read.
         meshes: Link name -> its collision meshes, read when they are asked for; scaled as
             the robot is, without its padding, by which nothing grows a mesh.
@@ -76,9 +63,8 @@ class Robot:
             spheres as they were read or fitted, without padding, scale and attached objects.
         sphere_sources: Link name -> where its spheres are from: "file", "urdf", "tiled"
             over boxes and cylinders, or "fitted".
-        geometry_as_read: ``geometry`` without padding and scale: what belongs to
-            ``link_spheres``.
-        meshes_as_read: ``meshes`` of all links, scaled and padded ones too.
+        geometry_as_read, meshes_as_read: ``geometry`` and ``meshes`` without padding and
+            scale: what belongs to ``link_spheres``.
         attached: Name of each attached object -> the link that carries it.
         held: Name of each attached object -> its shape.
     """
@@ -87,7 +73,7 @@ class Robot:
     joint_names: tuple[str, ...]
     locked: dict[str, float]
     velocity_limits: Float[np.ndarray, "dof"]
-    base_pose: Float[np.ndarray, "4 4"]
+    base_pose: Pose
     link_names: tuple[str, ...]
     geometry: dict[str, tuple[PrimitiveGeometry, ...]]
     named_states: dict[str, np.ndarray]
@@ -95,7 +81,6 @@ class Robot:
     disabled_pairs: dict[frozenset[str], str]
     arrays: KinematicArrays
     _links: dict[str, Attachment] = field(repr=False)
-    _torch: TorchKinematics = field(repr=False)
     meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     link_spheres: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     sphere_sources: dict[str, str] = field(default_factory=dict, repr=False)
@@ -136,22 +121,20 @@ class Robot:
 
         Args:
             path: The URDF (xacro expanded).
-            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is one.
-                Without an SRDF, ``disabled_pairs`` is generated: links joined by a joint or
-                rigid to each other, links whose spheres always overlap, and links that
-                stay far apart, both judged by ``matrix_samples`` random configurations.
+            srdf: The SRDF; None takes ``<stem>.srdf`` beside the URDF if there is one. Without
+                an SRDF, ``disabled_pairs`` is generated: links joined by a joint or rigid to
+                each other, links whose spheres always overlap, and links that stay far apart,
+                both judged by ``matrix_samples`` random configurations.
             spheres: Collision spheres: a YAML file (``collision_spheres: {link:
                 [{center: [x, y, z], radius: r}]}``), a robot file of cuRobo, an XRDF file,
                 such content as a mapping, or None: ``<stem>_spheres.yml`` beside the URDF,
                 else spheres that enclose the URDF's own geometry (spheres are taken as
                 they are). "fit" does so in any case.
             base_pose: (4, 4) pose of the root link in the world; None is identity.
-            joints: Joints of a configuration, in the order wanted. None takes the
-                SRDF group "arm" if there is one, else all joints that move and do
-                not mimic another.
-            locked: Values for joints not in ``joints``. Default for each: its value
-                in the SRDF (state "ready" first, then file order), else 0 or the
-                limit next to it.
+            joints: Joints of a configuration, in the order wanted. None takes the SRDF group
+                "arm" if there is one, else all joints that move and do not mimic another.
+            locked: Values for joints not in ``joints``. Default for each: its value in the
+                SRDF (state "ready" first, then file order), else 0 or the limit next to it.
             group: Instead of ``joints``: an SRDF group, whose joints are taken.
             package_dirs: Where ``package://NAME/...`` leads to: folders that hold packages,
                 or a mapping from a name to its folder. ROS_PACKAGE_PATH, AMENT_PREFIX_PATH
@@ -160,8 +143,7 @@ class Robot:
             matrix_samples: For the pairs that are generated.
 
         Raises:
-            RobotError: Something above is malformed or does not fit together; the
-                message names it.
+            RobotError: Something above is malformed or does not fit together.
         """
         path = Path(path)
         model = load_model(path, package_dirs)
@@ -171,9 +153,11 @@ class Robot:
         semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
         active = choose_joints(model, semantics, joints, group)
         fixed_values = lock_values(model, semantics, active, locked or {})
-        base = rigid_pose(np.eye(4) if base_pose is None else base_pose)
+        base = rigid_pose(
+            "base_pose", np.eye(4) if base_pose is None else base_pose, error=RobotError
+        )
         chosen = link_spheres(model, path, spheres, fit or SphereFit())
-        arrays, links = build_arrays(model, active, fixed_values, chosen.rows, base)
+        arrays, links = kinematics.build_arrays(model, active, fixed_values, chosen.rows, base)
         stated = None if srdf is None else semantics.disabled
         tested, disabled, sampled = pairs.choose_pairs(
             model, arrays, chosen, stated, matrix_samples
@@ -194,7 +178,6 @@ class Robot:
             disabled_pairs=disabled,
             arrays=arrays,
             _links=links,
-            _torch=TorchKinematics(arrays),
             meshes=meshes,
             link_spheres=chosen.rows,
             sphere_sources=chosen.sources,
@@ -241,7 +224,7 @@ class Robot:
         return self.arrays.sphere_link
 
     @property
-    def collision_pairs(self) -> Int[np.ndarray, "pairs 2"]:
+    def collision_pairs(self) -> Pairs:
         """Link pairs to test for self-collision, indices into ``link_names``."""
         return self.arrays.pairs
 
@@ -258,16 +241,18 @@ class Robot:
         return np.clip(np.zeros(self.dof), self.lower, self.upper)
 
     @functools.cached_property
+    def _torch(self) -> TorchKinematics:
+        return TorchKinematics(self.arrays)
+
+    @functools.cached_property
     def reach(self) -> float:
         """Upper bound on how far any sphere gets from the root link's origin, metres."""
-        return reach_bound(self.arrays)
+        return kinematics.reach_bound(self.arrays)
 
     def links_of(self, name: str) -> tuple[str, ...]:
         """The links with collision spheres that a name stands for.
 
-        Args:
-            name: A link of ``link_names`` or an SRDF group. Where both have the name, it
-                is the link.
+        A link outranks an SRDF group of the same name.
 
         Raises:
             RobotError: There is no such link or group, or it has no collision spheres.
@@ -277,9 +262,8 @@ class Robot:
         members = tuple(link for link in self.groups.get(name, ()) if link in self.link_names)
         if members:
             return members
-        what = "is"
-        if name in self.groups or name in self._links:
-            what = "has no collision spheres, so it is"
+        known = name in self.groups or name in self._links
+        what = "has no collision spheres, so it is" if known else "is"
         raise RobotError(
             f"{name!r} {what} no link or group of {self.name} to check; "
             f"links: {list(self.link_names)}, groups: {sorted(self.groups)}"
@@ -297,14 +281,15 @@ class Robot:
             q to any order. Batched already: torch.vmap over it is not supported.
 
         Raises:
-            RobotError: q is not numbers, has another dtype, a wrong last dimension, or values
-                that are not finite.
+            RobotError: q is not finite numbers, or has another dtype or last dimension.
         """
         import torch
 
         if not isinstance(q, torch.Tensor):
             with torch.no_grad():
-                return self.sphere_centers(torch.tensor(joint_values(q, self, "q"))).numpy()
+                return self.sphere_centers(
+                    torch.tensor(kinematics.joint_values(q, self, "q"))
+                ).numpy()
         if q.ndim == 0 or q.shape[-1] != self.dof:
             raise RobotError(f"q has shape {tuple(q.shape)}; expected {self._expected('(..., ')}")
         if not bool(torch.isfinite(q.detach()).all()):
@@ -315,18 +300,12 @@ class Robot:
         return world.reshape(*q.shape[:-1], *world.shape[1:])
 
     def link_poses(self, q: Any) -> dict[str, np.ndarray]:
-        """World poses of all links of the URDF.
-
-        Args:
-            q: (dof,) configuration.
+        """World poses (4, 4) of all links of the URDF, by name, for one configuration.
 
         Raises:
             RobotError: See :meth:`check_configuration`.
-
-        Returns:
-            Link name -> (4, 4).
         """
-        R, t = frame_poses(self.arrays, self.check_configuration(q)[None])
+        R, t = kinematics.frame_poses(self.arrays, self.check_configuration(q)[None])
         poses = {}
         for link, sits in self._links.items():
             frame = np.eye(4)
@@ -334,20 +313,16 @@ class Robot:
             poses[link] = frame @ sits.T
         return poses
 
-    def solid_balls(self, q: Any) -> SolidBalls:
+    def solid_balls(self, q: Any) -> surfaces.SolidBalls:
         """What the robot itself fills: balls inside its solids, where collision spheres hold them.
 
-        From the collision geometry of the URDF and the meshes of attached objects as they
-        are: padding and scale do not count. Meshes are read; a second or two for an arm, kept
-        for other configurations.
-
-        Args:
-            q: (dof,) configuration.
+        From the collision geometry of the URDF and the meshes of attached objects as they are,
+        without padding and scale. Takes a second or two for an arm, the first time.
 
         Raises:
             RobotError: See :meth:`check_configuration`.
         """
-        return solid_balls.solid_balls(self, q)
+        return surfaces.solid_balls(self, q)
 
     def random_configuration(self, rng: np.random.Generator) -> Float[np.ndarray, "dof"]:
         """A uniform configuration within the limits."""
@@ -361,12 +336,10 @@ class Robot:
         Raises:
             RobotError: The length is wrong or a value is not a finite number.
         """
-        array = joint_values(q, self, "a configuration")
+        array = kinematics.joint_values(q, self, "a configuration")
         if array.shape != (self.dof,):
-            raise RobotError(
-                f"a configuration of {self.name} has shape {array.shape}; "
-                f"expected {self._expected('(')}"
-            )
+            found = f"a configuration of {self.name} has shape {array.shape}"
+            raise RobotError(f"{found}; expected {self._expected('(')}")
         if not np.isfinite(array).all():
             named = zip(self.joint_names, array.tolist(), strict=True)
             bad = {name: value for name, value in named if not math.isfinite(value)}
@@ -375,25 +348,18 @@ class Robot:
 
     @functools.cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What is usable but odd: links that stand out of the spheres that a file gives them, by
-        samples of their surface, and links that nothing checks; with the remedy."""
+        """What is usable but odd: links that stand out of their spheres, or that nothing checks."""
         return robot_warnings(self)
 
     def with_base_pose(self, base_pose: ArrayLike) -> Robot:
-        """The same robot standing elsewhere; shares everything but the base.
-
-        Args:
-            base_pose: (4, 4) pose of the root link in the world.
+        """The same robot with its root link at another (4, 4) pose in the world.
 
         Raises:
             RobotError: The pose is not a rigid motion.
         """
-        base = rigid_pose(base_pose)
-        arrays = dataclasses.replace(
-            self.arrays,
-            base_R=np.ascontiguousarray(base[:3, :3]),
-            base_t=np.ascontiguousarray(base[:3, 3]),
-        )
+        base = rigid_pose("base_pose", base_pose, error=RobotError)
+        R, t = base[:3, :3].copy(), base[:3, 3].copy()
+        arrays = dataclasses.replace(self.arrays, base_R=R, base_t=t)
         return dataclasses.replace(self, base_pose=base, arrays=arrays)
 
     def with_padding(
@@ -402,17 +368,16 @@ class Robot:
         """The same robot with larger (or smaller) links, scaled first and then padded.
 
         Padding adds to the radius of every sphere, so clearance falls by exactly that much;
-        solids of ``geometry`` are grown by it all around. A scale moves spheres and solids
-        of a link away from (or towards) the centre of the ball around the link's spheres
-        and multiplies their size; above 1, spheres are widened so that they also hold what
-        they held before. Scaled and padded spheres hold the scaled and padded solids.
+        solids of ``geometry`` are grown by it all around. A scale moves spheres and solids of a
+        link away from (or towards) the centre of the ball around the link's spheres and
+        multiplies their size. Scaled and padded spheres hold the scaled and padded solids, and
+        what they held before.
 
         As in MoveIt, padding counts against the world only: links may come as near to each
-        other as before. MoveIt differs in three ways: it scales every shape about the
-        shape's own origin; its padding moves each face of a box outward, corners farther,
-        where ours is a distance in every direction; and it leaves the scale out of
-        self-collision, where ours counts (pairs that then touch at ``neutral`` are logged).
-        A scale above 1 makes generated "Never" pairs of that link tested again.
+        other as before. MoveIt differs in three ways: it scales every shape about its own
+        origin; its padding moves each face of a box outward, corners farther; and it leaves the
+        scale out of self-collision, where ours counts (pairs that then touch at ``neutral`` are
+        logged). A scale above 1 makes generated "Never" pairs of that link tested again.
 
         Args:
             padding: Metres, 0 or more: one number, or a table by link or group whose other
@@ -470,9 +435,7 @@ class Robot:
     def report(self) -> RobotReport:
         """Compare the spheres with the geometry of the URDF, and list what is not tested.
 
-        For every link: whether its spheres hold it (proved), how much of it, and how far
-        they stand out. Takes a second or so for an arm. Padding, scale and attached
-        objects do not enter.
+        Takes a second or so for an arm. Padding, scale and attached objects do not enter.
 
         Raises:
             RobotError: A mesh file cannot be read; missing ones are reported as such.
@@ -485,18 +448,13 @@ class Robot:
         Where spheres are coarse, or a locked joint stands badly, a pair can refuse most of
         them.
 
-        Args:
-            samples: Uniform configurations within the limits.
-            seed: Of these.
-
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
         """
         return pairs.touching_shares(self.arrays, self.link_names, samples, seed)
 
     def write_spheres(self, path: str | Path) -> None:
-        """Write ``link_spheres`` as YAML; beside the URDF as ``<stem>_spheres.yml`` it is
-        read from then on, which spares the fit. Reading gives the same numbers, bit by bit.
+        """Write ``link_spheres`` as YAML, to be read bit by bit as ``<stem>_spheres.yml``.
 
         The buffer of a file of cuRobo or XRDF is written as ``padding``, apart from the radii;
         that of :meth:`with_padding` is not written.

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Files of collision spheres: this package's YAML, cuRobo's, and XRDF."""
+"""Collision spheres of links: of a file (this package's YAML, cuRobo's, XRDF), else fitted."""
 
 from __future__ import annotations
 
 import functools
+import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from vprism_plan._files import reading, write_text
+from vprism_plan._shapes import Spheres
 from vprism_plan.errors import RobotError
+from vprism_plan.robots.sphere_fit import SphereFit, enclosing_spheres, fit_spheres
+from vprism_plan.robots.surfaces import link_triangles
+from vprism_plan.robots.urdf import RobotModel
 
 LinkSpheres = dict[str, np.ndarray]
 """Link name -> (n, 4) rows (x, y, z, radius) in the link's frame, metres."""
@@ -26,22 +30,102 @@ _LONGEST_VALUE = 1000  # characters; a number is read in the square of that
 _EXPECTED = "'collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}'"
 
 
+FIT = "fit"
+# So many tiles are taken as they are; what needs more is fitted, which needs fewer.
+_FEW_TILES = 12
+_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ChosenSpheres:
+    """The spheres of a robot's links, and where they are from."""
+
+    rows: LinkSpheres  # never empty
+    sources: dict[str, str]  # "file", "urdf" (of its own), "tiled" (over its solids) or "fitted"
+    padding: dict[str, float] = field(default_factory=dict)  # metres that a file adds to them
+
+
+def link_spheres(
+    model: RobotModel,
+    urdf_path: Path,
+    spheres: str | Path | Mapping[str, Any] | None,
+    fit: SphereFit,
+) -> ChosenSpheres:
+    """Choose and validate the collision spheres of a robot, see :meth:`Robot.from_urdf`."""
+    has = f"links: {list(model.links)}"
+    named = set(fit.max_spheres) if isinstance(fit.max_spheres, Mapping) else set()
+    if named - model.links.keys():
+        raise RobotError(f"max_spheres names the links {sorted(named - model.links.keys())}; {has}")
+    if spheres is None:
+        beside = urdf_path.with_name(f"{urdf_path.stem}_spheres.yml")
+        spheres = beside if beside.is_file() else FIT
+    if isinstance(spheres, str) and spheres == FIT:
+        chosen = _from_geometry(model, model.links, fit)
+        if not chosen.rows:
+            remedy = "add <collision> elements, or pass spheres={link: [{center, radius}]}"
+            raise RobotError(f"'{urdf_path}': no link has collision geometry; {remedy}")
+        return chosen
+    table = read_spheres(spheres)
+    known = {name: rows for name, rows in table.spheres.items() if name in model.links}
+    for link, rows in table.spheres.items():
+        if link not in model.links and (len(rows) or not table.foreign):
+            raise RobotError(f"{table.source} gives spheres for the unknown link '{link}'; {has}")
+    solid = [name for name, link in model.links.items() if link.primitives or link.meshes]
+    bare = [name for name in solid if name not in known]
+    if bare and not table.foreign:
+        raise RobotError(
+            f"{table.source} gives no spheres for the links {bare}, which have collision "
+            "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
+            "on purpose"
+        )
+    emptied = [name for name, rows in known.items() if not len(rows) and name in solid]
+    if emptied and table.foreign:
+        odd = "%s leaves the links %s without spheres; they have geometry that is not checked"
+        _logger.warning(odd, table.source, emptied)
+    rest = _from_geometry(model, bare, fit)
+    if rest.rows:
+        _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
+    everything, sources = known | rest.rows, dict.fromkeys(known, "file") | rest.sources
+    held = {name: everything[name] for name in model.links if len(everything.get(name, ()))}
+    if not held:
+        raise RobotError(f"{table.source} gives no link a sphere; a robot needs at least one")
+    return ChosenSpheres(held, {name: sources[name] for name in held}, table.padding)
+
+
+def _from_geometry(model: RobotModel, links: Iterable[str], fit: SphereFit) -> ChosenSpheres:
+    """Spheres that hold the collision geometry of the URDF."""
+    rows: LinkSpheres = {}
+    sources: dict[str, str] = {}
+    for name in links:
+        link = model.links[name]
+        own = [solid for solid in link.primitives if solid.kind == "sphere"]
+        rest = [solid for solid in link.primitives if solid.kind != "sphere"]
+        parts = [enclosing_spheres(solid) for solid in own]
+        tiles = [enclosing_spheres(solid) for solid in rest]
+        if link.meshes or sum(map(len, tiles)) > _FEW_TILES:
+            surface = link_triangles(rest, link.meshes)
+            tolerance, most = fit.allowed(surface), fit.most(name, surface)
+            parts.append(fit_spheres(surface, tolerance, most))
+            sources[name] = "fitted"
+        elif tiles:
+            parts += tiles
+            sources[name] = "tiled"
+        elif own:
+            sources[name] = "urdf"
+        if parts:
+            rows[name] = np.vstack(parts)
+    return ChosenSpheres(rows, sources)
+
+
+# -------------------------------------------------------------------------------------- files
 @dataclass(frozen=True)
 class SphereTable:
-    """What a file or a mapping says of spheres.
+    """What a file or a mapping says of spheres; links that a foreign one leaves out are fitted."""
 
-    Attributes:
-        source: For messages.
-        spheres: Spheres by link, those that are switched off left out; a link may have none.
-        padding: Metres by which links' spheres are to grow against the world.
-        foreign: Whether another program's file: links that it leaves out are then fitted,
-            and links it adds are passed over if they have no spheres.
-    """
-
-    source: str
-    spheres: LinkSpheres
-    padding: dict[str, float] = field(default_factory=dict)
-    foreign: bool = False
+    source: str  # for messages
+    spheres: LinkSpheres  # those that are switched off left out; a link may have none
+    padding: dict[str, float] = field(default_factory=dict)  # metres against the world
+    foreign: bool = False  # another program's, which may name links that the robot lacks
 
 
 def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
@@ -85,7 +169,7 @@ def _understood(content: Any, source: str, folder: Path) -> SphereTable:
     alone = isinstance(content, Mapping) and "robot" in content
     spheres_of = _table(content, source, off=alone)
     padding: dict[str, float] = {}
-    if isinstance(content, Mapping) and "collision_spheres" in content and not alone:
+    if "collision_spheres" in content and not alone:
         own = content.get("padding")
         unknown = sorted(set(own) - set(spheres_of)) if isinstance(own, Mapping) else []
         if unknown:
@@ -105,11 +189,7 @@ def _yaml(path: Path) -> Any:
 
 @functools.cache
 def _loader() -> Any:
-    """YAML's safe loader, with two rules more.
-
-    It would keep only the last of several lists for one link, and a few aliases of aliases
-    stand for more values than any memory holds.
-    """
+    """YAML's safe loader, without a second list for a link, or aliases that no memory holds."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -139,15 +219,14 @@ def _loader() -> Any:
             node = super().compose_mapping_node(anchor)
             seen = set()
             for key, _ in node.value:
+                problem = None
                 if not isinstance(key, yaml.ScalarNode):
-                    raise yaml.constructor.ConstructorError(
-                        problem="a key is no plain name", problem_mark=key.start_mark
-                    )
-                if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        problem=f"the key '{key.value}' occurs twice; join the two",
-                        problem_mark=key.start_mark,
-                    )
+                    problem = "a key is no plain name"
+                elif key.value in seen:
+                    problem = f"the key '{key.value}' occurs twice; join the two"
+                if problem is not None:
+                    mark = key.start_mark
+                    raise yaml.constructor.ConstructorError(problem=problem, problem_mark=mark)
                 seen.add(key.value)
             return node
 
@@ -181,10 +260,8 @@ def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
         name = next(iter(geometries))
     chosen = geometries.get(name)
     if not isinstance(chosen, Mapping) or "spheres" not in chosen:
-        raise RobotError(
-            f"{source}: the section 'collision' names the geometry {name!r}, which has no spheres; "
-            f"geometries: {sorted(map(str, geometries))}"
-        )
+        found = f"the section 'collision' names the geometry {name!r}, which has no spheres"
+        raise RobotError(f"{source}: {found}; geometries: {sorted(map(str, geometries))}")
     spheres = _table(chosen["spheres"], source, off=True)
     padding = _padding(section.get("buffer_distance"), spheres, source)
     return SphereTable(source, spheres, padding, foreign=True)
@@ -195,15 +272,14 @@ def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]
     padding = {}
     for link, value in table.items():
         try:
-            number = float(value)
+            grown = float(value)
         except (TypeError, ValueError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise RobotError(
-                f"{source}: the buffer of link '{link}' is {value!r}; it must be metres"
-            )
-        if number > 0.0 and len(spheres.get(link, ())):
-            padding[str(link)] = number
+            grown = math.nan
+        if not math.isfinite(grown):
+            found = f"the buffer of link '{link}' is {value!r}"
+            raise RobotError(f"{source}: {found}; it must be metres")
+        if grown > 0.0 and len(spheres.get(link, ())):
+            padding[str(link)] = grown
     return padding
 
 
@@ -215,32 +291,28 @@ def _table(content: Any, source: str, off: bool) -> LinkSpheres:
     return {str(link): _rows(link, entries, source, off) for link, entries in content.items()}
 
 
-def _rows(link: str, entries: Any, source: str, off: bool) -> Float[np.ndarray, "n 4"]:
-    if entries is None:
-        entries = []
+def _rows(link: str, entries: Any, source: str, off: bool) -> Spheres:
+    entries = [] if entries is None else entries
     if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
         raise RobotError(f"{source}: the spheres of '{link}' are {entries!r}; expected a list")
     rows = np.empty((len(entries), 4))
     for row, entry in zip(rows, entries, strict=True):
+        found = f"{source}: a sphere of '{link}' is {entry!r}"
         try:
             x, y, z = entry["center"]
             row[:] = float(x), float(y), float(z), float(entry["radius"])
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise RobotError(
-                f"{source}: a sphere of '{link}' is {entry!r}; expected "
-                "{center: [x, y, z], radius: r} in metres"
-            ) from error
+            wanted = "expected {center: [x, y, z], radius: r} in metres"
+            raise RobotError(f"{found}; {wanted}") from error
         if not np.isfinite(row).all() or (row[3] <= 0 and not off):
-            raise RobotError(
-                f"{source}: a sphere of '{link}' is {entry!r}; centre and radius must be finite "
-                "and the radius positive"
-            )
+            wanted = "centre and radius must be finite and the radius positive"
+            raise RobotError(f"{found}; {wanted}")
     return rows[rows[:, 3] > 0.0]
 
 
 def write_spheres(
     path: str | Path,
-    spheres: Mapping[str, Float[np.ndarray, "n 4"]],
+    spheres: Mapping[str, Spheres],
     note: str = "",
     padding: Mapping[str, float] | None = None,
 ) -> None:
@@ -250,8 +322,7 @@ def write_spheres(
         path: The file.
         spheres: Link -> (n, 4) rows (x, y, z, radius), link frame, metres.
         note: Lines for a comment at the top.
-        padding: Link -> metres that a robot's spheres grow by against the world, not
-            contained in their radii.
+        padding: Link -> metres that spheres grow by against the world, not in their radii.
     """
     lines = [f"# {line}".rstrip() for line in note.splitlines()]
     lines.append("collision_spheres:")

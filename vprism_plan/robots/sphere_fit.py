@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Few spheres that hold a link: its surface triangle by triangle, and what is inside it.
+"""Spheres that hold a link: fitted to its surface and what is inside it, or tiles of a solid.
 
 A sphere of radius ``r`` whose centre lies ``a`` deep in a solid stands out of it by ``r - a``
-at most; one whose centre lies ``b`` outside, by ``r + b``. With the signed distance ``s`` to
-the surface, both are ``r + s(centre)``: the figure to keep small. The surface is cut into
-small triangles, each of which must lie in one sphere with all its corners (a ball is convex,
-so with all of itself). Three steps, all without chance:
+at most; one whose centre lies ``b`` outside, by ``r + b``: with the signed distance ``s`` to
+the surface, both are ``r + s(centre)``. The surface is cut into small triangles, each of which
+must lie in one sphere. Three steps, all without chance:
 
 1. A greedy choice among centres inside the link, for the smallest ``r + s`` by bisection.
 2. In turns, each triangle goes to the sphere that stands out least by holding it, and each
@@ -17,28 +16,25 @@ so with all of itself). Three steps, all without chance:
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
+from vprism_plan._arguments import number, whole
+from vprism_plan._shapes import Indices, Points, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.surfaces import Surface, with_hull
 
 _MOST, _ARM_SIZED = 12, 0.35
 _CENTRES, _MORE_CENTRES = 400, 1000
-# What spheres of an object may stand out by without more of them, as a share of its diagonal.
-_CLOSE = 0.015
-# Where it is of more triangles, as scans are, spheres hold boxes around some of them.
-_MANY = 25_000
-_ROUNDS = 30
-# Relative and absolute (metres): what rounding may take away from a radius.
-_SLACK, _HAIR = 1e-9, 1e-9
-_STEPS = np.array(
-    [[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.float64
-)
+_CLOSE = 0.015  # of an object's diagonal, that spheres may stand out by without more of them
+_MANY, _ROUNDS = 25_000, 30  # triangles beyond which boxes around them are held, as of scans
+_SLACK, _HAIR = 1e-9, 1e-9  # relative, and metres: what rounding may take away from a radius
+_STEPS = np.array(list(np.ndindex(3, 3, 3)), dtype=np.float64) - 1.0
 _STEPS /= np.maximum(np.linalg.norm(_STEPS, axis=1, keepdims=True), 1.0)
 
 
@@ -46,13 +42,12 @@ _STEPS /= np.maximum(np.linalg.norm(_STEPS, axis=1, keepdims=True), 1.0)
 class SphereFit:
     """How spheres are fitted to links that have none.
 
-    Of each link the fewest spheres are taken that stand out by no more than the tolerance,
-    and where ``max_spheres`` do not suffice, so many, which stand out as little as they can.
+    Of each link the fewest spheres are taken that stand out by no more than the tolerance, or
+    ``max_spheres``, which stand out as little as they can.
 
     Attributes:
         tolerance: Metres by which a sphere may stand out of its link.
-        relative: The same as a share of the diagonal of the link's box; the smaller of the
-            two counts, so that fingers are not drowned.
+        relative: The same as a share of the diagonal of the link's box; the smaller counts.
         max_spheres: At most so many for each link: one number, or a table by link. None, and
             links that the table leaves out: 12, and for links whose box has a diagonal above
             0.35 m so many more as their surface is larger, 64 at most.
@@ -67,15 +62,13 @@ class SphereFit:
 
     def __post_init__(self) -> None:
         for name in ("tolerance", "relative"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise RobotError(f"{name} is {value!r}; it must be finite and above 0")
+            number(name, getattr(self, name), 0.0, above=True, error=RobotError)
         table = self.max_spheres
         for most in table.values() if isinstance(table, Mapping) else [table]:
-            if most is not None and most < 1:
-                raise RobotError(f"max_spheres is {most}; every link needs at least 1")
+            if most is not None:
+                whole("max_spheres", most, 1, error=RobotError)
 
-    def most(self, link: str, triangles: Float[np.ndarray, "f 3 3"]) -> int:
+    def most(self, link: str, triangles: Triangles) -> int:
         """Return the largest number of spheres for a link with this surface."""
         table = self.max_spheres
         most = table.get(link) if isinstance(table, Mapping) else table
@@ -83,18 +76,16 @@ class SphereFit:
             return int(most)
         return min(64, max(_MOST, math.ceil(_MOST * (_diagonal(triangles) / _ARM_SIZED) ** 2)))
 
-    def allowed(self, triangles: Float[np.ndarray, "f 3 3"]) -> float:
+    def allowed(self, triangles: Triangles) -> float:
         """Return the metres by which a sphere may stand out of these triangles."""
         return min(self.tolerance, self.relative * _diagonal(triangles))
 
 
-def _diagonal(triangles: Float[np.ndarray, "f 3 3"]) -> float:
+def _diagonal(triangles: Triangles) -> float:
     return float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
 
 
-def fit_spheres(
-    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int
-) -> Float[np.ndarray, "n 4"]:
+def fit_spheres(triangles: Triangles, tolerance: float, max_spheres: int) -> Spheres:
     """Spheres whose union holds a surface, and what it encloses.
 
     Of the inside, the cells of a lattice (18 to 40 along the longest edge) are held that the
@@ -103,8 +94,7 @@ def fit_spheres(
     Args:
         triangles: (f, 3, 3) corners, metres; closed or not, in one piece or many.
         tolerance: Metres by which spheres may stand out if `max_spheres` suffice for it.
-        max_spheres: At most so many (a hollow that they leave is filled beyond that, by
-            spheres that do not stand out).
+        max_spheres: At most so many, but for a hollow that they leave.
 
     Returns:
         (n, 4) rows (x, y, z, radius), metres; the same for equal arguments.
@@ -113,9 +103,7 @@ def fit_spheres(
     return _fit(corners.tobytes(), tolerance, max_spheres).copy()
 
 
-def hold_object(
-    triangles: Float[np.ndarray, "f 3 3"], max_spheres: int = 32
-) -> Float[np.ndarray, "n 4"]:
+def hold_object(triangles: Triangles, max_spheres: int = 32) -> Spheres:
     """As :func:`fit_spheres`, but never more than so many, and no open shell counts as solid.
 
     Figures of how far they stand out are in ``tests/robots/test_attached.py``.
@@ -131,13 +119,13 @@ def hold_object(
 
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
-def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Float[np.ndarray, "n 4"]:
+def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Spheres:
     return _fitted(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance, max_spheres)
 
 
 def _fitted(
-    triangles: Float[np.ndarray, "f 3 3"], tolerance: float, max_spheres: int, strict: bool = False
-) -> Float[np.ndarray, "n 4"]:
+    triangles: Triangles, tolerance: float, max_spheres: int, strict: bool = False
+) -> Spheres:
     surface = Surface.of(triangles, tolerance, _MANY if strict else None)
     index = np.argwhere(surface.filled)
     centres = surface.lower + surface.cell * (index + 0.5)
@@ -157,7 +145,7 @@ def _fitted(
     return _filled_up(surface, spheres, max(protrusion, 0.0) if strict else 0.0)
 
 
-def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> list[int]:
+def _smallest(reach: np.ndarray, depth: Values, count: int) -> list[int]:
     """Centres of at most `count` spheres that hold all and stand out least, by bisection."""
     alone = reach.max(axis=1) - depth
     best, low, high = [int(alone.argmin())], 0.0, float(alone.min())
@@ -171,7 +159,7 @@ def _smallest(reach: np.ndarray, depth: Float[np.ndarray, "c"], count: int) -> l
     return best
 
 
-def _candidate_cells(depth: Float[np.ndarray, "n"], most: int) -> Int[np.ndarray, "c"]:
+def _candidate_cells(depth: Values, most: int) -> Indices:
     """Cells to centre spheres on: the deepest ones and an even selection of the others."""
     if len(depth) <= most:
         return np.arange(len(depth))
@@ -180,12 +168,8 @@ def _candidate_cells(depth: Float[np.ndarray, "n"], most: int) -> Int[np.ndarray
     return np.unique(np.concatenate([deepest, spread]))
 
 
-def _greedy_cover(reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int) -> list[int] | None:
-    """Choose spheres until all is held: each time the one that holds most of what is new.
-
-    Returns:
-        Indices, or None if more than `most` would be needed.
-    """
+def _greedy_cover(reach: np.ndarray, radius: Values, most: int) -> list[int] | None:
+    """Choose spheres until all is held, always the one that holds most of what is new."""
     holds = reach <= radius[:, None]
     if not holds.any(axis=0).all():
         return None
@@ -202,9 +186,7 @@ def _greedy_cover(reach: np.ndarray, radius: Float[np.ndarray, "c"], most: int) 
     return chosen
 
 
-def _settled(
-    surface: Surface, centres: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "m 4"], float]:
+def _settled(surface: Surface, centres: Points) -> tuple[Spheres, float]:
     """Move spheres until their largest protrusion stands still; return it, too."""
     centres = centres.copy()
     reach = surface.reach(centres)
@@ -226,9 +208,7 @@ def _settled(
     return _tightened(surface, centres, reach, radius)
 
 
-def _moved(
-    surface: Surface, centre: Float[np.ndarray, "3"], own: Int[np.ndarray, "k"]
-) -> Float[np.ndarray, "3"]:
+def _moved(surface: Surface, centre: Vector, own: Indices) -> Vector:
     """Where a sphere that holds these triangles stands out least, by a pattern search."""
     from scipy.spatial.distance import cdist
 
@@ -251,11 +231,8 @@ def _moved(
 
 
 def _tightened(
-    surface: Surface,
-    centres: Float[np.ndarray, "n 3"],
-    reach: Float[np.ndarray, "n t"],
-    radius: Float[np.ndarray, "n"],
-) -> tuple[Float[np.ndarray, "m 4"], float]:
+    surface: Surface, centres: Points, reach: Float[np.ndarray, "n t"], radius: Values
+) -> tuple[Spheres, float]:
     """Cut every radius to what no other sphere holds, worst first."""
     centres, reach, radius = centres.copy(), reach.copy(), radius.copy()
     kept = np.ones(len(centres), dtype=bool)
@@ -274,9 +251,7 @@ def _tightened(
     return spheres, float((radius + surface.signed(centres))[kept].max())
 
 
-def _filled_up(
-    surface: Surface, spheres: Float[np.ndarray, "n 4"], room: float
-) -> Float[np.ndarray, "m 4"]:
+def _filled_up(surface: Surface, spheres: Spheres, room: float) -> Spheres:
     """Add spheres that stand out by `room` until every cell that no surface reaches is held."""
     index = np.argwhere(surface.whole)
     middles = surface.lower + surface.cell * (index + 0.5)
@@ -294,7 +269,7 @@ def _filled_up(
 
 
 def _cells_held(
-    middles: Float[np.ndarray, "n 3"], edge: float, spheres: Float[np.ndarray, "m 4"], deep: int = 3
+    middles: Points, edge: float, spheres: Spheres, deep: int = 3
 ) -> Bool[np.ndarray, "n"]:
     """Whether cubes lie in the union of spheres: each, or each of its eighths, in one."""
     offsets = np.array(list(np.ndindex(2, 2, 2))) - 0.5
@@ -307,3 +282,81 @@ def _cells_held(
         parts = (middles[~held][:, None] + 0.5 * edge * offsets).reshape(-1, 3)
         held[~held] = _cells_held(parts, 0.5 * edge, spheres, deep - 1).reshape(-1, 8).all(axis=1)
     return np.asarray(held)
+
+
+# -------------------------------------------------------------------------------------- tiles
+# Pieces of about this size (metres) protrude by about half of it.
+_TILE_EDGE, _MAX_TILES = 0.06, 64
+
+
+def enclosing_spheres(solid: PrimitiveGeometry) -> Spheres:
+    """Spheres whose union holds a solid.
+
+    A box is cut into box cells, a cylinder into slices of rings of sectors; each piece gets a
+    ball through its corners, which are what is farthest from the ball's centre.
+
+    Returns:
+        (n, 4) rows (x, y, z, radius) in the link's frame, metres.
+    """
+    if solid.kind == "sphere":
+        return np.array([[*solid.T_link[:3, 3], solid.size[0] + solid.padding]])
+    local = _tile_cylinder(*solid.size) if solid.kind == "cylinder" else _tile_box(solid.size)
+    local[:, :3] = local[:, :3] @ solid.T_link[:3, :3].T + solid.T_link[:3, 3]
+    # Neither rounding nor a proof, for which a cylinder is a prism, may find a gap at corners.
+    local[:, 3] = local[:, 3] * (1.0 + 1e-3) + solid.padding
+    return local
+
+
+def _tile_cylinder(radius: float, length: float) -> Spheres:
+    """A ball on the axis and rings of balls around it, repeated along the axis."""
+    edge = _TILE_EDGE
+    while True:
+        rings = math.ceil(radius / edge)
+        # A slender cylinder gains nothing from slices much thinner than it is wide.
+        slices = math.ceil(length / max(0.5 * edge, min(edge, radius)))
+        count = 1 + int(_sectors(radius, rings, edge).sum())
+        if count * slices <= _MAX_TILES or count == slices == 1:
+            break
+        edge *= 1.1
+    disc = _tile_disc(radius, rings, edge)
+    step = length / slices
+    heights = (np.arange(slices) + 0.5) * step - 0.5 * length
+    rows = np.empty((slices, len(disc), 4))
+    rows[..., :2] = disc[:, :2]
+    rows[..., 2] = heights[:, None]
+    rows[..., 3] = np.hypot(disc[:, 2], 0.5 * step)
+    return rows.reshape(-1, 4)
+
+
+def _sectors(radius: float, rings: int, edge: float) -> Indices:
+    """Into how many sectors each ring of a disc but the innermost is cut."""
+    outer = np.arange(2, rings + 1) * (radius / rings)
+    return np.maximum(4, np.ceil(2 * math.pi * outer / edge)).astype(np.int64)
+
+
+def _tile_disc(radius: float, rings: int, edge: float) -> Points:
+    """Circles (x, y, radius) whose union holds a disc."""
+    width = radius / rings
+    circles = [np.array([[0.0, 0.0, width]])]
+    for ring, n in enumerate(_sectors(radius, rings, edge).tolist(), start=1):
+        inner, outer = ring * width, (ring + 1) * width
+        half = math.pi / n
+        # Equally far from the sector's inner and outer corners.
+        middle = (inner + outer) / (2 * math.cos(half))
+        reach = math.hypot(outer * math.cos(half) - middle, outer * math.sin(half))
+        turn = 2 * math.pi * np.arange(n) / n
+        circles.append(
+            np.column_stack([middle * np.cos(turn), middle * np.sin(turn), np.full(n, reach)])
+        )
+    return np.vstack(circles)
+
+
+def _tile_box(size: Sequence[float]) -> Spheres:
+    edges = np.asarray(size)
+    edge = min(_TILE_EDGE, float(edges.min()))
+    while (counts := np.ceil(edges / edge).astype(int)).prod() > _MAX_TILES:
+        edge *= 1.1
+    cell = edges / counts
+    axes = [(np.arange(n) + 0.5) * c - 0.5 * e for n, c, e in zip(counts, cell, edges, strict=True)]
+    centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.column_stack([centers, np.full(len(centers), 0.5 * np.linalg.norm(cell))])

@@ -15,28 +15,23 @@ import numpy as np
 
 from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.plain_xml import robot_element
+from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
 from vprism_plan.robots.urdf import RobotModel
 
+Names = dict[str, tuple[str, ...]]
 RIGID = "Rigid"  # why a pair is not tested, where no joint moves its links
 _logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class SemanticModel:
-    """What an SRDF adds to a URDF.
+    """What an SRDF adds to a URDF, in file order."""
 
-    Attributes:
-        groups: Group name -> names of the joints in it, in file order.
-        group_links: Group name -> names of the links in it, in file order.
-        states: (state name, group) -> joint name -> value, in file order.
-        disabled: Unordered link pair -> the reason the file gives.
-    """
-
-    groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    group_links: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    groups: Names = field(default_factory=dict)  # of joints
+    group_links: Names = field(default_factory=dict)
+    # (state, group) -> joint -> value
     states: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
-    disabled: dict[frozenset[str], str] = field(default_factory=dict)
+    disabled: dict[frozenset[str], str] = field(default_factory=dict)  # pair -> reason
 
     def state_value(self, joint: str) -> float | None:
         """The joint's value in the first state that names it ("ready" before others)."""
@@ -59,36 +54,28 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     """Read an SRDF and check every name in it against the URDF.
 
     Raises:
-        RobotError: The file is missing or malformed, or names links or joints the
-            robot does not have: a disabled pair with a typing error would
-            otherwise disable nothing, or the wrong thing.
+        RobotError: The file is missing or malformed, or names links or joints the robot does
+            not have: a disabled pair with a typing error would disable nothing.
     """
     path = Path(path)
     if not path.is_file():
         raise RobotError(f"no SRDF file at '{path}'; give an existing file, or leave srdf=None")
-    with reading(path, "a usable SRDF", RobotError):
+    with reading(path, "a usable SRDF", RobotError, MOST_BYTES):
         root = robot_element(path, "an SRDF")
         groups, links = _groups(root, model, path)
         states, disabled = _states(root, model, path), _disabled(root, model, path)
         return SemanticModel(groups, links, states, disabled)
 
 
-def _groups(
-    root: ET.Element, model: RobotModel, path: Path
-) -> tuple[dict[str, tuple[str, ...]], dict[str, tuple[str, ...]]]:
-    """The joints and the links of every group.
-
-    As in MoveIt, the links of a group are those that its joints move directly: the base
-    of a chain is not one of them, nor is what hangs below a joint's child.
-    """
-    groups: dict[str, tuple[str, ...]] = {}
-    links: dict[str, tuple[str, ...]] = {}
+def _groups(root: ET.Element, model: RobotModel, path: Path) -> tuple[Names, Names]:
+    """The joints and the links of every group: as in MoveIt, what its joints move directly."""
+    groups: Names = {}
+    links: Names = {}
     parent_of = {joint.child: joint for joint in model.joints}
     # A virtual joint ties the base to the world; it is no joint of the URDF.
     virtual = {element.get("name", "") for element in root.findall("virtual_joint")}
     for group in root.findall("group"):
-        joints: list[str] = []
-        named: list[str] = []
+        joints, named = list[str](), list[str]()
         for member in group:
             name = member.get("name", "")
             if member.tag == "joint" and name not in virtual:
@@ -103,18 +90,16 @@ def _groups(
                 named += links[name]
             elif member.tag == "chain":
                 base = _known(member.get("base_link", ""), model.links, "link", path)
-                tip = _known(member.get("tip_link", ""), model.links, "link", path)
+                tip = link = _known(member.get("tip_link", ""), model.links, "link", path)
                 chain: list[str] = []
-                while tip != base:
-                    if tip not in parent_of:
-                        raise RobotError(
-                            f"group '{group.get('name')}' in '{path}': "
-                            f"'{base}' is not above '{member.get('tip_link')}'"
-                        )
-                    chain.append(parent_of[tip].name)
-                    tip = parent_of[tip].parent
-                joints += reversed(chain)
-                named += [model.joint_map[joint].child for joint in reversed(chain)]
+                while link != base:
+                    if link not in parent_of:
+                        where = f"group '{group.get('name')}' in '{path}'"
+                        raise RobotError(f"{where}: '{base}' is not above '{tip}'")
+                    chain.insert(0, link)
+                    link = parent_of[link].parent
+                joints += [parent_of[link].name for link in chain]
+                named += chain
         groups[group.get("name", "")] = tuple(dict.fromkeys(joints))
         links[group.get("name", "")] = tuple(dict.fromkeys(named))
     return groups, links
@@ -133,10 +118,9 @@ def _states(
             except ValueError:
                 values[name] = math.nan
             if not math.isfinite(values[name]):
-                raise RobotError(
-                    f"state '{state.get('name')}' in '{path}' gives joint '{name}' the value "
-                    f"{joint.get('value')!r}; one finite number is supported"
-                )
+                where = f"state '{state.get('name')}' in '{path}'"
+                found = f"gives joint '{name}' the value {joint.get('value')!r}"
+                raise RobotError(f"{where} {found}; give one finite number")
         states[state.get("name", ""), state.get("group", "")] = values
     return states
 
@@ -144,19 +128,16 @@ def _states(
 def _disabled(root: ET.Element, model: RobotModel, path: Path) -> dict[frozenset[str], str]:
     pairs: dict[frozenset[str], str] = {}
     for element in root.findall("disable_collisions"):
-        names = [
-            _known(element.get(key, ""), model.links, "link", path) for key in ("link1", "link2")
-        ]
-        pairs[frozenset(names)] = element.get("reason", "")
+        ends = (element.get(key, "") for key in ("link1", "link2"))
+        pair = frozenset(_known(end, model.links, "link", path) for end in ends)
+        pairs[pair] = element.get("reason", "")
     return pairs
 
 
-def _known(name: str, valid: object, what: str, path: Path) -> str:
-    if name not in valid:  # type: ignore[operator]
-        raise RobotError(
-            f"'{path}' names the {what} '{name}', which the robot does not have; "
-            f"valid: {sorted(valid)}"  # type: ignore[call-overload]
-        )
+def _known(name: str, valid: Mapping[str, Any], what: str, path: Path) -> str:
+    if name not in valid:
+        found = f"'{path}' names the {what} '{name}', which the robot does not have"
+        raise RobotError(f"{found}; valid: {sorted(valid)}")
     return name
 
 
@@ -173,10 +154,8 @@ def choose_joints(
             raise RobotError(f"both joints and the group {group!r} are given; give one of them")
         joints = [name for name in semantics.groups.get(group, ()) if name in valid]
         if not joints:
-            raise RobotError(
-                f"the SRDF of '{model.name}' has no group {group!r} with joints that move; "
-                f"groups: {sorted(semantics.groups)}"
-            )
+            found = f"the SRDF of '{model.name}' has no group {group!r} with joints that move"
+            raise RobotError(f"{found}; groups: {sorted(semantics.groups)}")
     if joints is None:
         arm = [name for name in semantics.groups.get("arm", ()) if name in valid]
         chosen = tuple(arm) or valid
@@ -195,10 +174,7 @@ def choose_joints(
 
 
 def lock_values(
-    model: RobotModel,
-    semantics: SemanticModel,
-    active: Sequence[str],
-    given: Mapping[str, float],
+    model: RobotModel, semantics: SemanticModel, active: Sequence[str], given: Mapping[str, float]
 ) -> dict[str, float]:
     """The value of every actuated joint that is not in the configuration."""
     rest = [name for name in model.actuated if name not in active]
@@ -208,19 +184,13 @@ def lock_values(
     values = {}
     for name in rest:
         joint = model.joint_map[name]
-        stated = semantics.state_value(name)
-        if name in given:
-            value = float(given[name])
-        elif stated is not None:
-            value = stated
-        else:
+        value = float(given[name]) if name in given else semantics.state_value(name)
+        if value is None:
             value = min(max(0.0, joint.lower), joint.upper)
         within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
         if not (math.isfinite(value) and within):
-            raise RobotError(
-                f"joint '{name}' is locked at {value}; its limits are "
-                f"[{joint.lower:.6g}, {joint.upper:.6g}]"
-            )
+            limits = f"[{joint.lower:.6g}, {joint.upper:.6g}]"
+            raise RobotError(f"joint '{name}' is locked at {value}; its limits are {limits}")
         values[name] = value
     return values
 
@@ -241,10 +211,8 @@ def write_srdf(path: str | Path, robot: Any) -> None:
         )
     root = ET.Element("robot", {"name": robot.name})
     of_joints = {"arm": robot.joint_names}
-    states = [
-        ("arm", name, dict(zip(robot.joint_names, q, strict=True)))
-        for name, q in robot.named_states.items()
-    ]
+    named = robot.named_states.items()
+    states = [("arm", name, dict(zip(robot.joint_names, q, strict=True))) for name, q in named]
     if robot.locked:
         of_joints["locked"] = tuple(robot.locked)
         states.append(("locked", "locked", robot.locked))
@@ -259,8 +227,7 @@ def write_srdf(path: str | Path, robot: Any) -> None:
         for joint, value in values.items():
             ET.SubElement(element, "joint", {"name": joint, "value": repr(float(value))})
     for pair in sorted(disabled.keys() - set(passing), key=sorted):
-        first, last = sorted(pair)[0], sorted(pair)[-1]
-        ends = {"link1": first, "link2": last, "reason": disabled[pair]}
+        ends = {"link1": min(pair), "link2": max(pair), "reason": disabled[pair]}
         ET.SubElement(root, "disable_collisions", ends)
     ET.indent(root)
     write_text(path, '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n")

@@ -16,17 +16,14 @@ import numpy as np
 from vprism_plan._files import reading
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry, find_mesh
-from vprism_plan.robots.plain_xml import robot_element
+from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of the tree; ``lower``/``upper`` are -pi/pi for continuous joints.
-
-    Of a joint that others mimic, they are narrowed so that these stay in their own limits.
-    """
+    """A joint of the tree; limits are narrowed by mimicking ones, and -pi, pi where continuous."""
 
     name: str
     kind: str
@@ -74,11 +71,7 @@ class RobotModel:
         return tuple(j.name for j in self.joints if j.moves and j.mimic is None)
 
     def resolve_mimic(self, name: str) -> tuple[str, float, float]:
-        """Follow a chain of mimic joints to its driver.
-
-        Returns:
-            (driver, multiplier, offset): value = multiplier * driver + offset.
-        """
+        """Follow mimic joints to (driver, multiplier, offset): multiplier * driver + offset."""
         multiplier, offset = 1.0, 0.0
         mimic = self.joint_map[name].mimic
         while mimic is not None:
@@ -91,28 +84,23 @@ class RobotModel:
 
 _FARTHEST_LIMIT = 1e4  # radians or metres; SDF writes 1e16 for "none"
 _SMALLEST, _LARGEST = 1e-6, 1e3  # metres of a solid, which is cut into tiles
-# Tables of a robot grow with the square of its links; PR2 has 90.
-_MOST_LINKS = 1000
+_MOST_LINKS = 1000  # tables of a robot grow with the square of its links; PR2 has 90
 _ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
 # Of each solid, the attributes of its size, and how many numbers these hold.
 _SIZES = {"box": (("size",), 3), "cylinder": (("radius", "length"), 2), "sphere": (("radius",), 1)}
 
 
 def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel:
-    """Read a URDF file.
-
-    Only what kinematics and collision need is looked at: visuals, inertias, transmissions and
-    simulator tags vary most between files, and a mistake in them must not stop a planner.
+    """Read a URDF file; mistakes in what neither kinematics nor collision needs are passed over.
 
     Raises:
-        RobotError: The file is missing or malformed, or describes something that
-            is not a tree of links joined by revolute, continuous, prismatic and
-            fixed joints.
+        RobotError: The file is missing or malformed, or describes something that is not a tree
+            of links joined by revolute, continuous, prismatic and fixed joints.
     """
     path = Path(path)
     if not path.is_file():
         raise RobotError(f"no URDF file at '{path}'; give the path of an existing .urdf file")
-    with reading(path, "a usable URDF (check_urdf may say more)", RobotError):
+    with reading(path, "a usable URDF (check_urdf may say more)", RobotError, MOST_BYTES):
         root = robot_element(path, "a URDF")
         if any("xacro" in element.tag for element in root.iter()):
             raise RobotError(f"'{path}' holds xacro macros; expand it first: xacro IN > OUT.urdf")
@@ -135,7 +123,7 @@ def _name(element: ET.Element, path: Path) -> str:
 
 
 def _numbers(text: str) -> list[float]:
-    return [float(word) for word in text.split()]
+    return [float(word) for word in text.replace(",", " ").split()]
 
 
 def _number(element: ET.Element | None, key: str) -> float | None:
@@ -143,7 +131,7 @@ def _number(element: ET.Element | None, key: str) -> float | None:
     return None if text is None else float(text)
 
 
-def _origin(owner: ET.Element, whose: str, path: Path) -> np.ndarray:
+def _origin(owner: ET.Element, whose: str) -> np.ndarray:
     """Where an <origin> puts its owner, (4, 4)."""
     import trimesh.transformations
 
@@ -154,14 +142,12 @@ def _origin(owner: ET.Element, whose: str, path: Path) -> np.ndarray:
     for key in ("xyz", "rpy"):
         text = element.get(key, "0 0 0")
         try:
-            parts[key] = _numbers(text)
+            parts[key] = [float(word) for word in text.split()]
         except ValueError:
             parts[key] = []
         if len(parts[key]) != 3 or not all(map(math.isfinite, parts[key])):
-            raise RobotError(
-                f"{whose} in '{path}' has an <origin> with {key}={text!r}; write finite numbers, "
-                "three of them"
-            )
+            wanted = "write finite numbers, three of them"
+            raise RobotError(f"{whose} has an <origin> with {key}={text!r}; {wanted}")
     T = trimesh.transformations.compose_matrix(translate=parts["xyz"], angles=parts["rpy"])
     return np.array(T, dtype=np.float64)
 
@@ -169,144 +155,121 @@ def _origin(owner: ET.Element, whose: str, path: Path) -> np.ndarray:
 def _link(element: ET.Element, path: Path, package_dirs: PackageDirs) -> Link:
     primitives, meshes = [], []
     name = _name(element, path)
+    whose = f"link '{name}' in '{path}'"
     for collision in element.findall("collision"):
-        T = _origin(collision, f"link '{name}'", path)
+        T = _origin(collision, whose)
         shape = collision.find("geometry/*")
         if shape is None:
-            raise RobotError(f"link '{name}' in '{path}' has a <collision> without a shape")
-        if shape.tag == "mesh":
-            meshes.append(_mesh(name, shape, T, path, package_dirs))
-        else:
-            primitives.append(_primitive(name, shape, T, path))
+            raise RobotError(f"{whose} has a <collision> without a shape")
+        if shape.tag != "mesh":
+            primitives.append(_primitive(shape, T, whose))
+            continue
+        filename = shape.get("filename")
+        if not filename:
+            raise RobotError(f"{whose} has a <mesh> without a filename; name a file")
+        found, searched = find_mesh(filename, path, package_dirs)
+        meshes.append(MeshFile(name, filename, _scale(shape, whose), T, found, tuple(searched)))
     return Link(name, tuple(primitives), tuple(meshes))
 
 
-def _mesh(
-    link: str, mesh: ET.Element, T: np.ndarray, path: Path, package_dirs: PackageDirs
-) -> MeshFile:
-    filename = mesh.get("filename")
-    if not filename:
-        raise RobotError(f"link '{link}' in '{path}' has a <mesh> without a filename; name a file")
-    scale = np.array(_numbers(mesh.get("scale", "").replace(",", " ")) or [1.0])
+def _scale(mesh: ET.Element, whose: str) -> np.ndarray:
+    scale = np.array(_numbers(mesh.get("scale", "")) or [1.0])
     scale = np.full(3, scale[0]) if len(scale) == 1 else scale
     if scale.shape != (3,) or not np.isfinite(scale).all() or (scale == 0.0).any():
-        raise RobotError(
-            f"link '{link}' in '{path}' has a mesh with scale {scale.tolist()}; write three finite "
-            "numbers other than 0"
-        )
-    found, searched = find_mesh(filename, path, package_dirs)
-    return MeshFile(link, filename, scale, T, found, tuple(searched))
+        wanted = "write three finite numbers other than 0"
+        raise RobotError(f"{whose} has a mesh with scale {scale.tolist()}; {wanted}")
+    return scale
 
 
-def _primitive(link: str, shape: ET.Element, T: np.ndarray, path: Path) -> PrimitiveGeometry:
+def _primitive(shape: ET.Element, T: np.ndarray, whose: str) -> PrimitiveGeometry:
     kind: Any = shape.tag
     if kind not in _SIZES:
-        raise RobotError(f"link '{link}' in '{path}' has a collision shape of Unknown tag: {kind}")
+        raise RobotError(f"{whose} has a collision shape of Unknown tag: {kind}")
     keys, expected = _SIZES[kind]
-    size = tuple(_numbers(" ".join(shape.attrib[key].replace(",", " ") for key in keys)))
+    size = tuple(_numbers(" ".join(shape.attrib[key] for key in keys)))
     if len(size) != expected or not all(_SMALLEST <= v <= _LARGEST for v in size):
-        raise RobotError(
-            f"link '{link}' in '{path}' has a {kind} of size {size}; "
-            f"sizes must be positive and finite, from {_SMALLEST:g} to {_LARGEST:g} m"
-        )
+        valid = f"sizes must be positive and finite, from {_SMALLEST:g} to {_LARGEST:g} m"
+        raise RobotError(f"{whose} has a {kind} of size {size}; {valid}")
     return PrimitiveGeometry(kind, size, T)
 
 
 def _joint(element: ET.Element, path: Path) -> Joint:
     name, kind = _name(element, path), element.get("type", "")
+    whose = f"joint '{name}' in '{path}'"
     ends = {}
     for part in ("parent", "child"):
         end = element.find(part)
         ends[part] = "" if end is None else end.get("link", "")
         if not ends[part]:
-            raise RobotError(f"joint '{name}' in '{path}' names no {part} link")
+            raise RobotError(f"{whose} names no {part} link")
     if kind not in _ALL_TYPES:
-        raise RobotError(f"joint '{name}' in '{path}' has type {kind!r}; valid: {_ALL_TYPES}")
+        raise RobotError(f"{whose} has type {kind!r}; valid: {_ALL_TYPES}")
     if kind in ("floating", "planar"):
         raise RobotError(
             f"joint '{name}' is {kind}; supported are revolute, continuous, prismatic and "
             "fixed. Replace it by a fixed joint and place the robot with base_pose"
         )
-    T = _origin(element, f"joint '{name}'", path)
+    T = _origin(element, whose)
     mimic, copied = None, element.find("mimic")
     if copied is not None and kind != "fixed":
         factors = float(copied.get("multiplier", 1.0)), float(copied.get("offset", 0.0))
         mimic = (copied.get("joint", ""), *factors)
         if not all(map(math.isfinite, factors)):
-            raise RobotError(f"joint '{name}' in '{path}' has a non-finite mimic factor: {mimic}")
-    lower, upper, velocity = _limits(element, name, kind, path)
-    axis = _axis(element, name, kind, path) if kind != "fixed" else np.array([1.0, 0.0, 0.0])
+            raise RobotError(f"{whose} has a non-finite mimic factor: {mimic}")
+    lower, upper, velocity = _limits(element, whose, kind)
+    axis = _axis(element, whose, kind) if kind != "fixed" else np.array([1.0, 0.0, 0.0])
     return Joint(name, kind, ends["parent"], ends["child"], T, axis, lower, upper, velocity, mimic)
 
 
-def _axis(joint: ET.Element, name: str, kind: str, path: Path) -> np.ndarray:
+def _axis(joint: ET.Element, whose: str, kind: str) -> np.ndarray:
     element = joint.find("axis")
-    axis = np.array(_numbers("1 0 0" if element is None else element.get("xyz", "1 0 0")))
+    text = "1 0 0" if element is None else element.get("xyz", "1 0 0")
+    axis = np.array([float(word) for word in text.split()])
     norm = float(np.linalg.norm(axis)) if axis.shape == (3,) else math.nan
     if not (math.isfinite(norm) and norm > 1e-9):
-        raise RobotError(
-            f"joint '{name}' in '{path}' has axis {axis.tolist()}; "
-            "an axis needs three finite numbers, not all zero"
-        )
+        wanted = "an axis needs three finite numbers, not all zero"
+        raise RobotError(f"{whose} has axis {axis.tolist()}; {wanted}")
+    # Tools disagree on whether the travel is scaled by the axis length.
     if kind == "prismatic" and abs(norm - 1.0) > 1e-3:
-        # Tools disagree on whether the travel is scaled by the axis length.
-        raise RobotError(
-            f"prismatic joint '{name}' in '{path}' has an axis of length {norm:.6g}; "
-            "write a unit axis"
-        )
+        raise RobotError(f"prismatic {whose} has an axis of length {norm:.6g}; write a unit axis")
     return axis / norm
 
 
-def _limits(joint: ET.Element, name: str, kind: str, path: Path) -> tuple[float, float, float]:
-    """Lower, upper and velocity limit; a velocity of 0 or none stated becomes inf.
-
-    Soft limits of a <safety_controller> narrow the range, as MoveIt has it: beyond them a
-    controller pushes back. Continuous joints have none.
-    """
+def _limits(joint: ET.Element, whose: str, kind: str) -> tuple[float, float, float]:
+    """Lower, upper and velocity limit (none or 0: inf); soft limits narrow it, as in MoveIt."""
     limit, soft = joint.find("limit"), joint.find("safety_controller")
     velocity = _number(limit, "velocity") or math.inf
     if not velocity >= 0.0:
-        raise RobotError(
-            f"joint '{name}' in '{path}' has velocity limit {velocity}; it must be positive"
-        )
+        raise RobotError(f"{whose} has velocity limit {velocity}; it must be positive")
     if kind == "continuous":
         return -math.pi, math.pi, velocity
     if kind == "fixed":
         return 0.0, 0.0, velocity
     lower, upper = _number(limit, "lower"), _number(limit, "upper")
     if lower is None or upper is None:
-        raise RobotError(
-            f"{kind} joint '{name}' in '{path}' has no lower and upper <limit>; "
-            "state both, or make it continuous"
-        )
+        remedy = "state both, or make it continuous"
+        raise RobotError(f"{kind} {whose} has no lower and upper <limit>; {remedy}")
     if not (math.isfinite(lower) and math.isfinite(upper)) or lower > upper:
-        raise RobotError(
-            f"joint '{name}' in '{path}' has limits [{lower}, {upper}]; "
-            "they must be finite with lower <= upper"
-        )
+        wanted = "they must be finite with lower <= upper"
+        raise RobotError(f"{whose} has limits [{lower}, {upper}]; {wanted}")
     if max(abs(lower), abs(upper)) > _FARTHEST_LIMIT:
         raise RobotError(
-            f"joint '{name}' in '{path}' has limits [{lower:g}, {upper:g}], beyond "
-            f"{_FARTHEST_LIMIT:g}; no search covers that: make it continuous, or state real limits"
+            f"{whose} has limits [{lower:g}, {upper:g}], beyond {_FARTHEST_LIMIT:g}; no search "
+            "covers that: make it continuous, or state real limits"
         )
     low, high = _number(soft, "soft_lower_limit"), _number(soft, "soft_upper_limit")
     low, high = (lower if low is None else low), (upper if high is None else high)
     lower, upper = max(lower, low), min(upper, high)
     if not (math.isfinite(low) and math.isfinite(high) and lower <= upper):
         raise RobotError(
-            f"joint '{name}' in '{path}' has a <safety_controller> whose soft limits "
-            f"[{low:g}, {high:g}] leave nothing of its range; correct them, or take it out"
+            f"{whose} has a <safety_controller> whose soft limits [{low:g}, {high:g}] leave "
+            "nothing of its range; correct them, or take it out"
         )
     return lower, upper, velocity
 
 
 def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) -> RobotModel:
-    """Order joints parents first, refusing anything that is not one tree.
-
-    Raises:
-        RobotError: Names are not unique or unknown, the joints do not make one tree, or a
-            joint mimics what it cannot.
-    """
+    """Order joints parents first, refusing anything that is not one tree."""
     link_map = {link.name: link for link in links}
     for what, named in (("link", links), ("joint", joints)):
         counts = Counter(item.name for item in named)
@@ -319,15 +282,12 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in link_map:
-                raise RobotError(
-                    f"joint '{joint.name}' in '{path}' refers to unknown link '{link}'; "
-                    f"links: {sorted(link_map)}"
-                )
+                found = f"joint '{joint.name}' in '{path}' refers to unknown link '{link}'"
+                raise RobotError(f"{found}; links: {sorted(link_map)}")
         if joint.child in parent_joint:
-            raise RobotError(
-                f"link '{joint.child}' in '{path}' has two parent joints: "
-                f"'{parent_joint[joint.child].name}' and '{joint.name}'; a URDF is a tree"
-            )
+            both = f"'{parent_joint[joint.child].name}' and '{joint.name}'"
+            found = f"link '{joint.child}' in '{path}' has two parent joints: {both}"
+            raise RobotError(f"{found}; a URDF is a tree")
         parent_joint[joint.child] = joint
     roots = [link.name for link in links if link.name not in parent_joint]
     if len(roots) != 1:
@@ -355,10 +315,9 @@ def _check_mimics(model: RobotModel, path: Path) -> None:
         while current.mimic is not None:
             driver = current.mimic[0]
             if driver not in model.joint_map or not model.joint_map[driver].moves:
-                raise RobotError(
-                    f"joint '{current.name}' in '{path}' mimics '{driver}', which is no moving "
-                    f"joint; valid: {[j.name for j in model.joints if j.moves]}"
-                )
+                found = f"joint '{current.name}' in '{path}' mimics '{driver}'"
+                valid = [j.name for j in model.joints if j.moves]
+                raise RobotError(f"{found}, which is no moving joint; valid: {valid}")
             if driver in seen:
                 raise RobotError(f"joint '{joint.name}' in '{path}' mimics itself through {seen}")
             seen.add(driver)
@@ -368,9 +327,8 @@ def _check_mimics(model: RobotModel, path: Path) -> None:
 def _narrowed(model: RobotModel, path: Path) -> dict[str, Joint]:
     """The joints that others mimic, with limits that keep these in their own.
 
-    A continuous joint becomes a revolute one if a limited joint follows it: where it may
-    turn without end, what follows it may not. So it does, within [-pi, pi], if a continuous
-    joint follows it by a factor that is no integer: that is elsewhere after a whole turn.
+    A continuous joint becomes a revolute one if a limited joint follows it, or a continuous one
+    by a factor that is no integer: that is elsewhere after a whole turn.
     """
     result: dict[str, Joint] = {}
     followers = [joint for joint in model.joints if joint.moves and joint.mimic is not None]
