@@ -60,7 +60,10 @@ class SplineField:
     ) -> Float[Tensor, "m s"]:
         """Value at points (metres), under the rule of each column; any order differentiable."""
         device, dtype = points.device, points.dtype
-        values = self._on(device, dtype)
+        if (device, dtype) not in self._tensors:
+            flat = torch.from_numpy(self.values.reshape(-1))
+            self._tensors[device, dtype] = flat.to(device=device, dtype=dtype)
+        values = self._tensors[device, dtype]
         sizes = self.values.shape[1:]
         top = torch.tensor(sizes, device=device).to(dtype) - 1.0
         origin = torch.as_tensor(self.origin, dtype=dtype, device=device)
@@ -87,14 +90,8 @@ class SplineField:
 
     @cached_property
     def blocks(self) -> Float32[np.ndarray, "g bx by bz"]:
-        """Lower bound of the value in each block of 4 x 4 x 4 cells."""
-        lowest = self.values
-        for axis, n in enumerate(lowest.shape[1:], start=1):
-            starts = 4 * np.arange((n - 1) // 4 + 1)[:, None]
-            # A point between nodes i and i + 1 hears of i - 1 to i + 2.
-            rows = np.clip(starts + np.arange(-1, 6), 0, n - 1)
-            lowest = np.take(lowest, rows, axis=axis).min(axis=axis + 1)
-        return np.ascontiguousarray(lowest)
+        """Lower bound of the value in each block; see `block_least`."""
+        return block_least(self.values)
 
     def packed(
         self, margin: float, room: float, planes: Float[np.ndarray, "p 4"]
@@ -107,14 +104,20 @@ class SplineField:
         head = [*self.origin, self.spacing, solid, float(len(planes)), margin, room]
         return np.array([*head, *np.asarray(planes, dtype=np.float64).reshape(-1)])
 
-    def _on(self, device: torch.device, dtype: torch.dtype) -> Tensor:
-        if (device, dtype) not in self._tensors:
-            flat = torch.from_numpy(self.values.reshape(-1))
-            self._tensors[device, dtype] = flat.to(device=device, dtype=dtype)
-        return self._tensors[device, dtype]
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_tensors": {}}
+
+
+def block_least(
+    values: Float32[np.ndarray, "g nx ny nz"],
+) -> Float32[np.ndarray, "g bx by bz"]:
+    """Return the least node that a spline in each block of 4 x 4 x 4 cells reads."""
+    for axis, n in enumerate(values.shape[1:], start=1):
+        starts = 4 * np.arange((n - 1) // 4 + 1)[:, None]
+        # A point between nodes i and i + 1 hears of i - 1 to i + 2.
+        rows = np.clip(starts + np.arange(-1, 6), 0, n - 1)
+        values = np.take(values, rows, axis=axis).min(axis=axis + 1)
+    return np.ascontiguousarray(values)
 
 
 def spline_weights(
@@ -168,7 +171,13 @@ def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spl
         ends = np.zeros(n, dtype=np.float32)
         ends[[0, -1]] = spacing**2
         rim += ends.reshape([-1 if a == axis else 1 for a in range(3)])
-    floor = _plane_distances(grid, planes)
+    floor = np.full(grid.shape, np.inf, dtype=np.float32)
+    for start in range(0, x, 16):
+        part = floor[start : start + 16]
+        nodes = grid.slab(start, start + len(part))
+        for row in planes:
+            away = (nodes @ row[:3] - row[3]).reshape(part.shape)
+            np.minimum(part, away, out=part, casting="same_kind")
     solid = bool(getattr(field, "solid_outside", False))
     merged = []
     for own in fields:
@@ -178,16 +187,3 @@ def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spl
         source = np.zeros(grid.shape, dtype=np.int16)
         merged.append(finish(NodeDistances(nodes, source), grid, (), solid).distance)
     return SplineField(np.stack(merged), grid.origin, spacing, solid)
-
-
-def _plane_distances(
-    grid: Grid, planes: Float[np.ndarray, "p 4"]
-) -> Float32[np.ndarray, "nx ny nz"]:
-    nearest = np.full(grid.shape, np.inf, dtype=np.float32)
-    for start in range(0, grid.shape[0], 16):
-        stop = min(start + 16, grid.shape[0])
-        nodes = grid.slab(start, stop)
-        for row in planes:
-            away = (nodes @ row[:3] - row[3]).reshape(stop - start, *grid.shape[1:])
-            np.minimum(nearest[start:stop], away, out=nearest[start:stop], casting="same_kind")
-    return nearest

@@ -5,24 +5,96 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vprism_plan._arguments import choice, number, whole
+from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
 from vprism_plan.planning.attempts import within_risk
 from vprism_plan.planning.goals import configuration, refuse
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import checked_seed
-from vprism_plan.trajopt._candidates import Candidates, Settings, path_clearance
-from vprism_plan.trajopt._default_cost import Defaults, has_world
-from vprism_plan.trajopt._seeds import make_seeds
+from vprism_plan.trajopt._candidates import MINIMISERS, Candidates, make_seeds, path_clearance
+from vprism_plan.trajopt._minimize import REASONS, Limits
+from vprism_plan.trajopt.cost import SumCost, TrajectoryCost
+from vprism_plan.trajopt.joint_costs import JointLimitCost, SmoothnessCost
 from vprism_plan.trajopt.result import OptimizeReport, OptimizeResult, SeedReport
+from vprism_plan.trajopt.risk_cost import RiskCost
+from vprism_plan.trajopt.sphere_costs import ClearanceCost, SelfCollisionCost
 
-METHODS = ("lbfgs", "adam")
 _FEWEST = 4  # waypoints: two inner ones, and a window of four around an edge
+
+# The default cost.
+_MARGIN = 0.02  # metres beyond the checker's margin from which obstacles push
+_APART = 0.005  # the same of links from each other
+_LIMITS = 0.02  # the same of joint limits, radians or metres
+_CLEAR, _OWN, _WITHIN = 300.0, 300.0, 300.0  # weights against squared velocity
+_RISK = 0.1  # the same of a risk that is as large as `max_risk`
+_BEND = 1e-3  # weight of squared acceleration: corners cost, curves hardly do
+_GROWTH = 0.005  # metres by which a repair's margin exceeds that of the one before
+
+
+def default_cost(checker: Any, kept: float | None = None) -> TrajectoryCost:
+    """Return the cost that `optimize` minimises if it is given none.
+
+    Squared velocity (which makes paths short and waypoints even) and a little acceleration,
+    plus clearance, self-collision and joint limits, each with a margin beyond what the
+    checker refuses, so that a converged trajectory passes. If the checker bounds risk, the
+    objects of the map enter as `RiskCost`, in the draws that edges are checked with: instead,
+    or beside their level set where the bound is below the world's `level`.
+
+    Args:
+        checker: a `CollisionChecker`; its margins, allowed contacts and bound on risk count.
+        kept: clearance, metres, that is to be kept, if that is more than the margin.
+
+    Raises:
+        PlanningError: the checker is something else.
+    """
+    return _Defaults(checker, kept).cost()
+
+
+class _Defaults:
+    """The default cost of a checker, and what repairs add to it; see `default_cost`."""
+
+    def __init__(self, checker: Any, kept: float | None) -> None:
+        if not isinstance(checker, CollisionChecker):
+            raise PlanningError(
+                f"there is no default cost for a {type(checker).__name__}; pass `cost`, or use "
+                "a CollisionChecker"
+            )
+        self._checker = checker
+        beyond = 0.0 if kept is None else kept - float(checker.config.margin)
+        self._margin = max(_MARGIN, beyond + 0.5 * _MARGIN)
+
+    def cost(self) -> TrajectoryCost:
+        smooth = SmoothnessCost(velocity=1.0, acceleration=_BEND, robot=self._checker.robot)
+        return SumCost(smooth, *self._keep_off(self._margin))
+
+    def guard(self, level: int) -> TrajectoryCost:
+        """What repair number `level`, from 1, adds: all but smoothness, from farther away."""
+        return SumCost(*self._keep_off(self._margin + _GROWTH * level))
+
+    def _keep_off(self, margin: float) -> list[TrajectoryCost]:
+        checker = self._checker
+        return [
+            ClearanceCost(checker, margin=margin, weight=_CLEAR),
+            *self._risk,
+            SelfCollisionCost(checker, margin=_APART, weight=_OWN),
+            JointLimitCost(checker.robot, margin=_LIMITS, weight=_WITHIN),
+        ]
+
+    @cached_property
+    def _risk(self) -> list[TrajectoryCost]:
+        """What stands for the map's objects where the checker judges them by draws."""
+        config = self._checker.config
+        if config.max_risk is None:
+            return []
+        return [RiskCost(self._checker, seed=config.risk_seed, weight=_RISK / config.max_risk)]
 
 
 def optimize(
@@ -93,75 +165,50 @@ def optimize(
         PlanningError: an argument is malformed, naming the value and the valid ones.
     """
     began = time.perf_counter()
-    limit = _checked_numbers(
-        seeds=seeds,
-        waypoints=waypoints,
-        method=method,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-        time_limit=time_limit,
-        repairs=repairs,
-        clearance_step=clearance_step,
-    )
-    number = checked_seed(seed)
-    q_start = configuration(start, checker.robot, "start")
-    q_goal = configuration(goal, checker.robot, "goal")
-    report = OptimizeReport(method=method, seed=number)
-    numbers = PlanReport(planner="optimize", seed=number, time_limit=limit)
-    for q, what in ((q_start, "start"), (q_goal, "goal")):
-        refusal = refuse(checker, q, what, numbers)
-        if refusal is not None:
-            return _refused(refusal, replace(report, total_time=time.perf_counter() - began))
-    begun, paths = make_seeds(checker, q_start, q_goal, _paths(initial), seeds, waypoints, number)
-    kept = _kept(checker, keep_clearance, paths, clearance_step)
-    minimised, guards = _costs(checker, cost, guard, kept)
-    settings = Settings(
-        cost=minimised,
-        guard=guards,
-        method=method,
-        iterations=max_iterations,
-        tolerance=tolerance,
-        repairs=repairs,
-        clearance_step=clearance_step,
-        kept=kept,
-    )
-    candidates = Candidates(checker, begun, paths, settings, began + limit)
-    result = within_risk(checker, candidates.attempt, limit)
-    return _answer(result, candidates, report, began)
-
-
-def _checked_numbers(
-    *,
-    seeds: int,
-    waypoints: int,
-    method: str,
-    max_iterations: int,
-    tolerance: float,
-    time_limit: float | None,
-    repairs: int,
-    clearance_step: float,
-) -> float:
-    """Refuse arguments that make no sense; return the time limit, infinite for None."""
-    if method not in METHODS:
-        raise PlanningError(f"method is {method!r}; valid values are {', '.join(METHODS)}")
+    choice("method", method, MINIMISERS, error=PlanningError)
     for name, value, least in (
         ("seeds", seeds, 1),
         ("waypoints", waypoints, _FEWEST),
         ("max_iterations", max_iterations, 1),
         ("repairs", repairs, 0),
     ):
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not whole or value < least:
-            raise PlanningError(f"{name} is {value!r}; it must be a whole number from {least}")
-    if not 0.0 < tolerance < 1.0:
-        raise PlanningError(f"tolerance is {tolerance!r}; it must be between 0 and 1")
-    if not clearance_step > 0.0:
-        raise PlanningError(f"clearance_step is {clearance_step!r}; it must be more than 0")
-    if time_limit is None:
-        return math.inf
-    if not time_limit > 0.0:
-        raise PlanningError(f"time_limit is {time_limit!r} s; it must be more than 0, or None")
-    return float(time_limit)
+        whole(name, value, least, error=PlanningError)
+    number("tolerance", tolerance, 0.0, 1.0, above=True, below=True, error=PlanningError)
+    number("clearance_step", clearance_step, 0.0, above=True, error=PlanningError)
+    limit = math.inf
+    if time_limit not in (None, math.inf):
+        limit = number("time_limit", time_limit, 0.0, unit="s", above=True, error=PlanningError)
+    seed = checked_seed(seed)
+    q_start = configuration(start, checker.robot, "start")
+    q_goal = configuration(goal, checker.robot, "goal")
+    report = OptimizeReport(method=method, seed=seed)
+    numbers = PlanReport(planner="optimize", seed=seed, time_limit=limit)
+    for q, what in ((q_start, "start"), (q_goal, "goal")):
+        refusal = refuse(checker, q, what, numbers)
+        if refusal is not None:
+            return OptimizeResult(
+                path=None,
+                status=refusal.status,  # type: ignore[arg-type]
+                message=refusal.message,
+                report=replace(report, total_time=time.perf_counter() - began),
+                explanation=refusal.explanation,
+            )
+    begun = make_seeds(checker, q_start, q_goal, _paths(initial), seeds, waypoints, seed)
+    kept = _kept(checker, keep_clearance, begun.given, clearance_step)
+    cost, guards = _costs(checker, cost, guard, kept)
+    candidates = Candidates(
+        checker,
+        begun,
+        cost=cost,
+        guard=guards,
+        method=method,
+        limits=Limits(max_iterations, tolerance, began + limit),
+        repairs=repairs,
+        clearance_step=clearance_step,
+        kept=kept,
+    )
+    result = within_risk(checker, candidates.attempt, limit)
+    return _answer(result, candidates, report, began)
 
 
 def _paths(initial: Any) -> list[Any]:
@@ -180,15 +227,10 @@ def _kept(
     checker: CheckerLike, keep: bool | np.bool_ | float, paths: list[np.ndarray], step: float
 ) -> float | None:
     """Return the clearance to be kept, metres."""
-    if isinstance(keep, bool | np.bool_):
-        if not keep:
-            return None
-    else:
-        if not math.isfinite(keep):
-            raise PlanningError(
-                f"keep_clearance is {keep!r}; it must be True, False or a number of metres"
-            )
-        return float(keep)
+    if not isinstance(keep, bool | np.bool_):
+        return number("keep_clearance", keep, unit="of metres, True or False", error=PlanningError)
+    if not keep:
+        return None
     if not paths:
         raise PlanningError(
             "keep_clearance is True, but there is no initial path whose clearance could be "
@@ -208,21 +250,11 @@ def _costs(
                 "(..., T, dof) -> (...)"
             )
     guards = None if guard is None else lambda _: guard
-    if cost is None or (guard is None and has_world(checker)):
-        defaults = Defaults(checker, kept)
+    if cost is None or (guard is None and isinstance(checker, CollisionChecker)):
+        defaults = _Defaults(checker, kept)
         cost = defaults.cost() if cost is None else cost
         guards = defaults.guard if guards is None else guards
     return cost, guards
-
-
-def _refused(refusal: PlanResult, report: OptimizeReport) -> OptimizeResult:
-    return OptimizeResult(
-        path=None,
-        status=refusal.status,  # type: ignore[arg-type]
-        message=refusal.message,
-        report=report,
-        explanation=refusal.explanation,
-    )
 
 
 def _answer(
@@ -240,33 +272,25 @@ def _answer(
             cost=float(minimum.value[s]),
             length=float(lengths[s]),
             iterations=int(candidates.iterations[s]),
-            stopped=candidates.stopped(s),
+            stopped=REASONS[int(minimum.reason[s])],
             refused="" if s == winner else candidates.refused[s],
         )
         for s, name in enumerate(candidates.seeds.names)
     )
-    found = result.report
+    of_path = (
+        "path_length", "waypoints", "min_clearance", "clearance_samples", "certified",
+        "tolerance", "shares", "risk", "risk_levels", "risk_time",
+    )  # fmt: skip
+    spent = ("rounds", "optimization_time", "verification_time", "motion_checks")
     report = replace(
         report,
         seeds=seeds,
         winner=winner,
-        rounds=candidates.rounds,
         evaluations=candidates.objective.evaluations,
-        optimization_time=candidates.optimization_time,
-        verification_time=candidates.verification_time,
-        motion_checks=candidates.motion_checks,
         cost=math.nan if winner is None else seeds[winner].cost,
-        path_length=found.path_length,
-        waypoints=found.waypoints,
-        min_clearance=found.min_clearance,
-        clearance_samples=found.clearance_samples,
-        kept_clearance=candidates.settings.kept,
-        certified=found.certified,
-        tolerance=found.tolerance,
-        shares=found.shares,
-        risk=found.risk,
-        risk_levels=found.risk_levels,
-        risk_time=found.risk_time,
+        kept_clearance=candidates.kept,
+        **{name: getattr(result.report, name) for name in of_path},
+        **{name: getattr(candidates, name) for name in spent},
         total_time=time.perf_counter() - began,
     )
     message = result.message
