@@ -6,6 +6,9 @@ trajectory, places the spheres, turns the slope of the cost at each sphere's cen
 and the forces into joint gradients: moments about the joints' axes, summed from the leaves to the
 base. `vprism_plan.trajopt` has the same in plain torch; the tests compare the two.
 
+Samples are configurations q (m, dof), the waypoint before each (`edge`), how far on the edge it
+is (`fraction`), and its share of the time (`weight`).
+
 Fields V (rules, nx, ny, nz) hold signed distances at nodes, E the least of them per block, and wf:
 origin x, y, z, spacing, solid outside, number of planes, margin, room, then the planes.
 """
@@ -15,7 +18,7 @@ import math
 import numpy as np
 
 from vprism_plan._kernels.jit import njit
-from vprism_plan._kernels.robot import fk_frames, place_link, place_spheres
+from vprism_plan._kernels.robot import fk_frames, place_link
 
 _SHORT = 1e-6  # metres; as in vprism_plan.trajopt.cost
 
@@ -66,10 +69,7 @@ def _wrench_gradient(T, rf, ri, W):
 
 @njit(cache=True, nogil=True)
 def _pull(T, C, F, active, rf, ri, weight, e, fraction, grad):
-    """Add to grad (T, dof) what forces F (3, spheres) at the centres C make of a sample.
-
-    Only active links have forces; the sample lies between waypoints e and e + 1.
-    """
+    """Add to grad (T, dof) what forces F (3, spheres) on active links make of a sample."""
     W = np.zeros((ri[0], 6))
     for link in range(ri[2]):
         if active[link]:
@@ -111,57 +111,6 @@ def pull_all(T, centers, frames, forces, rf, ri, grad):
         grad[n] = _wrench_gradient(T[n], rf, ri, W)
 
 
-@njit(cache=True, nogil=True)
-def subdivide(Q, delta, rf, ri, turns, spacing, max_turn, most, parts):
-    """Fill parts (T - 1,): into how many each edge of a trajectory is divided."""
-    C = np.empty((2, 3, ri[1]))
-    place_spheres(Q[0], rf, ri, C[0])
-    for e in range(len(parts)):
-        place_spheres(Q[e + 1], rf, ri, C[(e + 1) & 1])
-        square = 0.0
-        for s in range(ri[1]):
-            x = C[1, 0, s] - C[0, 0, s]
-            y = C[1, 1, s] - C[0, 1, s]
-            z = C[1, 2, s] - C[0, 2, s]
-            square = max(square, x * x + y * y + z * z)
-        turn = 0.0
-        for j in range(Q.shape[1]):
-            if turns[j]:
-                turn = max(turn, abs(delta[e, j]))
-        wanted = max(math.sqrt(square) / spacing, turn / max_turn)
-        parts[e] = max(1, math.ceil(min(wanted, float(most))))
-
-
-@njit(cache=True, nogil=True)
-def _samples(Q, delta, parts):
-    """Samples of a trajectory: configurations, edge, fraction of it, share of the time.
-
-    Sample k of an edge begins its part k; the shares are the trapezoid rule's.
-    """
-    edges = len(parts)
-    count = parts.sum() + 1
-    q = np.empty((count, Q.shape[1]))
-    edge = np.empty(count, np.int64)
-    fraction = np.empty(count)
-    weight = np.ones(count)
-    n = 0
-    before = 0.0
-    for e in range(edges + 1):
-        own = 1.0 / (parts[e] * edges) if e < edges else 0.0
-        for k in range(parts[e] if e < edges else 1):
-            edge[n] = e
-            fraction[n] = k / parts[e] if k > 0 else 0.0
-            for j in range(Q.shape[1]):
-                q[n, j] = Q[e, j]
-                if k > 0:
-                    q[n, j] += fraction[n] * delta[e, j]
-            if edges > 0:
-                weight[n] = 0.5 * (own + (own if k > 0 else before))
-            n += 1
-        before = own
-    return q, edge, fraction, weight
-
-
 # --- fields ------------------------------------------------------------------------
 
 
@@ -195,9 +144,7 @@ def _spline(V, rule, sx, sy, sz, h, slope):
     j, wy, dy = _taps(sy, V.shape[2])
     k, wz, dz = _taps(sz, V.shape[3])
     value = 0.0
-    gx = 0.0
-    gy = 0.0
-    gz = 0.0
+    gx = gy = gz = 0.0
     for a in range(3):
         for b in range(3):
             u = V[rule, i[a], j[b], k[0]]
@@ -328,8 +275,8 @@ def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, ac
 
 
 @njit(cache=True, nogil=True)
-def clearance(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
-    """Obstacle cost of one trajectory (T, dof) over time; adds its gradient to grad (T, dof)."""
+def clearance(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
+    """Obstacle cost of one trajectory over time; adds its gradient to grad (T, dof)."""
     T = np.empty((ri[0], 12))
     L = np.empty((ri[2], 3))
     C = np.empty((3, ri[1]))
@@ -338,7 +285,6 @@ def clearance(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
     active = np.zeros(ri[2], np.bool_)
     slope = np.empty(3)
     total = 0.0
-    q, edge, fraction, weight = _samples(Q, delta, parts)
     for i in range(len(q)):
         _frames(q[i], rf, ri, T, L)
         if _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, active):
@@ -352,7 +298,7 @@ def clearance(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
 
 
 @njit(cache=True, nogil=True)
-def clearance_by_length(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
+def clearance_by_length(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
     """The same over the ways of the spheres' centres; sample by sample, the last one kept."""
     n = ri[1]
     T = np.empty((2, ri[0], 12))
@@ -365,7 +311,6 @@ def clearance_by_length(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
     everywhere = np.ones(ri[2], np.bool_)
     slope = np.empty(3)
     total = 0.0
-    q, edge, fraction, _ = _samples(Q, delta, parts)
     for i in range(len(q) + 1):
         now = i & 1
         old = 1 - now
@@ -428,8 +373,7 @@ def _contacts(centers, rules, V, E, wf, radii, grown, reach):
         for s in range(centers.shape[1]):
             x, y, z = centers[i, s, 0], centers[i, s, 1], centers[i, s, 2]
             if _may_be_below(V, E, rules[s], wf, x, y, z, grown[s] + reach):
-                which[found, 0] = i
-                which[found, 1] = s
+                which[found] = (i, s)
                 depth[found] = grown[s] - _distance(V, rules[s], wf, x, y, z, slope)
                 for a in range(3):
                     slopes[found, a] = -slope[a]
@@ -437,8 +381,7 @@ def _contacts(centers, rules, V, E, wf, radii, grown, reach):
             for p in range(int(wf[5])):
                 value = _over(wf, 8 + 4 * p, x, y, z)
                 if value < radii[s] + reach:
-                    which[found, 0] = i
-                    which[found, 1] = s
+                    which[found] = (i, s)
                     depth[found] = radii[s] - value
                     for a in range(3):
                         slopes[found, a] = -wf[8 + 4 * p + a]
@@ -495,9 +438,7 @@ def ball_averages(centers, rules, radii, V, grid, nodes, weights, value, slopes)
             if min(gx, gy, gz) < -r or gx > tx + r or gy > ty + r or gz > tz + r:
                 continue
             for p in range(len(weights)):
-                x = gx + r * nodes[p, 0]
-                y = gy + r * nodes[p, 1]
-                z = gz + r * nodes[p, 2]
+                x, y, z = gx + r * nodes[p, 0], gy + r * nodes[p, 1], gz + r * nodes[p, 2]
                 if x <= 0.0 or y <= 0.0 or z <= 0.0 or x >= tx or y >= ty or z >= tz:
                     continue
                 value[n, s] += weights[p] * _spline(V, rules[s], x, y, z, h, slope)
@@ -522,9 +463,7 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
         a = ri[ri[10] + 2 * pair]
         b = ri[ri[10] + 2 * pair + 1]
         room = margin + kept - rf[ri[21] + 1 + pair]
-        x = L[a, 0] - L[b, 0]
-        y = L[a, 1] - L[b, 1]
-        z = L[a, 2] - L[b, 2]
+        x, y, z = L[a, 0] - L[b, 0], L[a, 1] - L[b, 1], L[a, 2] - L[b, 2]
         reach = rf[bo + 4 * a + 3] + rf[bo + 4 * b + 3] + room
         if reach <= 0.0 or x * x + y * y + z * z >= reach * reach:
             continue
@@ -537,26 +476,20 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
         t1 = ri[ri[9] + 4 * b + 2]
         for s in range(ri[ri[9] + 4 * a + 1], ri[ri[9] + 4 * a + 2]):
             px, py, pz = C[0, s], C[1, s], C[2, s]
-            x = px - L[b, 0]
-            y = py - L[b, 1]
-            z = pz - L[b, 2]
+            x, y, z = px - L[b, 0], py - L[b, 1], pz - L[b, 2]
             reach = rf[ro + s] + rf[bo + 4 * b + 3] + room
             if reach <= 0.0 or x * x + y * y + z * z >= reach * reach:
                 continue
             own = rf[ro + s] + room
             near = 0  # counted first: a loop without branches is vectorised
             for t in range(t0, t1):
-                x = px - C[0, t]
-                y = py - C[1, t]
-                z = pz - C[2, t]
+                x, y, z = px - C[0, t], py - C[1, t], pz - C[2, t]
                 reach = own + rf[ro + t]
                 near += x * x + y * y + z * z < reach * reach
             if near == 0:
                 continue
             for t in range(t0, t1):
-                x = px - C[0, t]
-                y = py - C[1, t]
-                z = pz - C[2, t]
+                x, y, z = px - C[0, t], py - C[1, t], pz - C[2, t]
                 square = x * x + y * y + z * z + _SHORT * _SHORT
                 reach = own + rf[ro + t]
                 if reach <= 0.0 or square >= reach * reach:
@@ -572,7 +505,7 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
 
 
 @njit(cache=True, nogil=True)
-def self_collision(Q, delta, parts, rf, ri, margin, kept, grad):
+def self_collision(q, edge, fraction, weight, rf, ri, margin, kept, grad):
     """Cost of links near each other of one trajectory; adds its gradient to grad (T, dof)."""
     T = np.empty((ri[0], 12))
     C = np.empty((3, ri[1]))
@@ -580,7 +513,6 @@ def self_collision(Q, delta, parts, rf, ri, margin, kept, grad):
     F = np.zeros((3, ri[1]))
     active = np.zeros(ri[2], np.bool_)
     total = 0.0
-    q, edge, fraction, weight = _samples(Q, delta, parts)
     for i in range(len(q)):
         _frames(q[i], rf, ri, T, L)
         value = _pair_terms(T, C, L, active, rf, ri, margin, kept, F)
@@ -640,11 +572,8 @@ def _near_draws(centers, rules, D, E, grid, grown, reach):
             if min(x, y, z) < 0.0 or x > tx or y > ty or z > tz:
                 continue
             if E[rules[s], int(x) >> 2, int(y) >> 2, int(z) >> 2] < grown[s] + reach:
-                rows[found, 0] = i
-                rows[found, 1] = s
-                places[found, 0] = x
-                places[found, 1] = y
-                places[found, 2] = z
+                rows[found] = (i, s)
+                places[found] = (x, y, z)
                 found += 1
     return rows[:found], places[:found]
 

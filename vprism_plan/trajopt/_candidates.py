@@ -20,7 +20,6 @@ from vprism_plan.planning.ompl_adapter import nearest_turns
 from vprism_plan.planning.path import interpolated, one_line, verified
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.trajopt._minimize import Limits, Minimum, adam, lbfgs
-from vprism_plan.trajopt.result import History
 
 _log = logging.getLogger(__name__)
 
@@ -38,13 +37,9 @@ _LOSS = 5e-4  # metres by which a kept clearance may be missed: what it is compu
 
 @dataclass(frozen=True)
 class Seeds:
-    """Trajectories to begin with.
+    """Trajectories q (S, T, dof) to begin with, and the initial paths as they were given.
 
-    Attributes:
-        names: what each is: "initial 0", "straight", "via 0", "noise 0", ...
-        q: (S, T, dof) waypoints; all begin at the start and end at the goal, up to whole
-            turns of continuous joints.
-        given: the initial paths as they were given, from start to goal.
+    All begin at the start and end at the goal, up to whole turns of continuous joints.
     """
 
     names: list[str]
@@ -62,7 +57,6 @@ def smooth_basis(inner: int, order: int) -> Float[np.ndarray, "n n"]:
 
     Its covariance is the inverse of D^T D with D the differences of that order, as STOMP
     (Kalakrishnan and others 2011) draws its noise; the largest standard deviation is 1.
-    Of order 1 it is a Brownian bridge; of order 2 it is also at rest at both ends.
     """
     D = np.eye(inner)
     for _ in range(order):
@@ -84,47 +78,26 @@ def along(path: Float[np.ndarray, "t dof"], count: int) -> Float[np.ndarray, "co
         return np.repeat(path[:1], count, axis=0)
     at = np.concatenate([[0.0], np.cumsum(steps[steps > 0.0])])
     places = np.linspace(0.0, at[-1], count)
-    if len(corners) <= count:
-        places = _onto(places, at)
+    if len(corners) <= count:  # one place each, in order, and the others evenly between them
+        order = np.arange(len(corners))
+        nearest = np.rint(at / at[-1] * (count - 1)).astype(np.int64)
+        nearest = np.maximum.accumulate(nearest - order) + order
+        nearest[-1] = count - 1
+        nearest = np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
+        places = np.interp(np.arange(count), nearest, at)
     rows = np.stack([np.interp(places, at, column) for column in corners.T], axis=1)
     rows[0], rows[-1] = path[0], path[-1]
     return rows
 
 
-def _onto(places: Float[np.ndarray, " n"], corners: Float[np.ndarray, " c"]) -> np.ndarray:
-    """Move one place onto each corner, in order, the others evenly between them."""
-    n = len(places)
-    nearest = np.rint(corners / corners[-1] * (n - 1)).astype(np.int64)
-    for i in range(1, len(corners)):  # no two corners on one place
-        nearest[i] = max(nearest[i], nearest[i - 1] + 1)
-    nearest[-1] = n - 1
-    for i in range(len(corners) - 2, 0, -1):
-        nearest[i] = min(nearest[i], nearest[i + 1] - 1)
-    return np.interp(np.arange(n), nearest, corners)
-
-
 def make_seeds(
-    checker: CheckerLike,
-    start: Float[np.ndarray, " dof"],
-    goal: Float[np.ndarray, " dof"],
-    initial: Sequence[Any],
-    count: int,
-    waypoints: int,
-    seed: int,
-) -> Seeds:
-    """Return initial paths, the straight line, and detours and noise in turns.
+    checker: CheckerLike, start: np.ndarray, goal: np.ndarray, initial: Sequence[Any],
+    count: int, waypoints: int, seed: int,
+) -> Seeds:  # fmt: skip
+    """Return initial paths, the straight line, and detours and noise in turns; see `optimize`.
 
-    Args:
-        checker: asked which middles of detours are free.
-        start: (dof,).
-        goal: (dof,); continuous joints go the short way round to it.
-        initial: paths (t, dof) from start to goal.
-        count: how many in all; at least the initial ones.
-        waypoints: of each.
-        seed: of every choice. A larger `count` only adds to those of a smaller one.
-
-    Raises:
-        PlanningError: an initial path does not lead from start to goal.
+    Continuous joints go the short way round to the goal. A larger `count` only adds to those of
+    a smaller one.
     """
     turns = np.asarray(checker.robot.continuous, dtype=bool)
     given = [_checked(path, i, start, goal, turns) for i, path in enumerate(initial)]
@@ -136,14 +109,13 @@ def make_seeds(
         names.append("straight")
     first, straight = found[0], found[-1]
     for i in range(count - len(found)):
-        if i % 2 == 0:
-            rng = np.random.default_rng([seed, 1, i // 2])
-            found.append(_detour(checker, straight, i // 2, rng))
-            names.append(f"via {i // 2}")
+        number, noise = divmod(i, 2)
+        rng = np.random.default_rng([seed, 1 + noise, number])
+        if noise:
+            found.append(_noisy(checker.robot, first, number, rng))
         else:
-            rng = np.random.default_rng([seed, 2, i // 2])
-            found.append(_noisy(checker.robot, first, i // 2, rng))
-            names.append(f"noise {i // 2}")
+            found.append(_detour(checker, straight, number, rng))
+        names.append(f"{'noise' if noise else 'via'} {number}")
     return Seeds(names, np.stack(found), given)
 
 
@@ -216,9 +188,7 @@ class Objective:
     is CHOMP's covariant gradient (Ratliff and others 2009) as a change of variables. The
     ends are not variables.
 
-    Args:
-        cost: any module (k, T, dof) -> (k,); if it has `terms`, they enter the history.
-        begun: (S, T, dof) the seeds.
+    `cost` is any module (k, T, dof) -> (k,); if it has `terms`, they enter the history.
     """
 
     def __init__(self, cost: Any, begun: Float[np.ndarray, "s t dof"]) -> None:
@@ -227,8 +197,8 @@ class Objective:
         self._guard: Any = None
         self._base = torch.from_numpy(begun)
         self._basis = torch.from_numpy(smooth_basis(begun.shape[1] - 2, 1))
-        self._terms: dict[str, np.ndarray] = {}
-        self._rows: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = []
+        self.terms: dict[str, np.ndarray] = {}
+        self.rows: list[tuple[int, np.ndarray, dict[str, np.ndarray]]] = []
         self._round = -1
 
     @property
@@ -266,10 +236,10 @@ class Objective:
         at = rows[better]
         self._best[at] = total[better]
         for name, values in terms.items():
-            column = self._terms.setdefault(name, np.zeros(len(self._best)))
+            column = self.terms.setdefault(name, np.zeros(len(self._best)))
             column[at.numpy()] = values.detach()[better].numpy()
-        copies = {name: values.copy() for name, values in self._terms.items()}
-        self._rows.append((self._round, self._best.numpy().copy(), copies))
+        copies = {name: values.copy() for name, values in self.terms.items()}
+        self.rows.append((self._round, self._best.numpy().copy(), copies))
         return total, gradient
 
     def values(self, q: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
@@ -289,22 +259,9 @@ class Objective:
             named["repair"] = self._weight * self._guard(q) + again * self._guard(around)
         return named
 
-    def history(self) -> History:
-        """Return what was noted."""
-        count = len(self._base)
-        empty = np.zeros(count)
-        return History(
-            cost=np.array([best for _, best, _ in self._rows]).reshape(-1, count),
-            terms={
-                name: np.array([terms.get(name, empty) for *_, terms in self._rows])
-                for name in self._terms
-            },
-            round=np.array([number for number, *_ in self._rows], dtype=np.int64),
-        )
-
 
 class Candidates:
-    """The trajectories of one query.
+    """The trajectories of one query; see `optimize`.
 
     Args:
         checker: whose joint limits hold.
@@ -312,7 +269,7 @@ class Candidates:
         cost: the module that is minimised.
         guard: level from 1 -> the module that repairs add at that level; None: no repairs.
         method: key of `MINIMISERS`.
-        limits: per seed and round; after the deadline nothing more is evaluated.
+        limits: per seed and round.
         repairs: rounds after the first, per bound on risk.
         clearance_step: distance between the samples of a reported clearance.
         kept: clearance, metres, that a path must keep; None: what the checker asks for.
@@ -430,7 +387,7 @@ class Candidates:
             if not judge.check_motion(a, b):
                 report = judge.check_motion_report(a, b)
                 return _refusal(path, edge, f"is refused: {one_line(report)}", report), edge
-        result = verified(judge, path, self.clearance_step, _no_numbers())
+        result = verified(judge, path, self.clearance_step, _NO_NUMBERS)
         self.motion_checks += result.report.motion_checks
         if self.kept is None or not result.solved:
             return result, -1
@@ -452,15 +409,14 @@ class Candidates:
         return next((seed for asked, seed in self._asked if asked is path), None)
 
 
-def _no_numbers() -> PlanReport:
-    return PlanReport(planner="optimize", seed=0, time_limit=0.0)
+_NO_NUMBERS = PlanReport(planner="optimize", seed=0, time_limit=0.0)
 
 
 def _refusal(path: Float[np.ndarray, "t dof"], edge: int, why: str, report: Any) -> PlanResult:
     return PlanResult(
         path=None,
         status="verification_failed",
-        report=_no_numbers(),
+        report=_NO_NUMBERS,
         message=f"edge {edge} of {len(path) - 1} {why}",
         approximate_path=path,
         explanation=report,
@@ -470,10 +426,7 @@ def _refusal(path: Float[np.ndarray, "t dof"], edge: int, why: str, report: Any)
 def path_clearance(
     checker: Any, path: Float[np.ndarray, "t dof"], step: float
 ) -> tuple[float, float]:
-    """Return the smallest clearance on a path, metres, and its place (edge plus fraction).
-
-    Of the whole path where the checker can bound it (`min_clearance`), else of samples.
-    """
+    """Return the smallest clearance on a path (else of samples of it), metres, and its place."""
     if hasattr(checker, "min_clearance"):
         answer = checker.min_clearance(path)
         return float(answer.clearance), float(answer.place)

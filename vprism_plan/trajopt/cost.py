@@ -5,7 +5,7 @@ those that compiled kernels compute become functions that autograd knows."""
 import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain, count
+from itertools import chain, count, pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -28,11 +28,8 @@ class TrajectoryCost(torch.nn.Module):
     Half precisions are computed in float32.
 
     Args:
-        weight: factor on the cost, finite and at least 0.
+        weight: factor on the cost, finite and at least 0, else ConfigError.
         name: what `terms` calls it.
-
-    Raises:
-        ConfigError: the weight is not that.
     """
 
     def __init__(self, weight: float = 1.0, name: str = "cost") -> None:
@@ -164,14 +161,23 @@ class Samples:
     Attributes:
         q: (M, dof), attached to the waypoints.
         trajectory: (M,) which trajectory each belongs to.
+        edge, fraction: (M,) the waypoint before each, and how far it is to the next one.
         weight: (M,) its share of the time (trapezoid rule); sums to 1 per trajectory.
         count: number of trajectories.
     """
 
     q: Float[Tensor, "m dof"]
     trajectory: Int[Tensor, " m"]
+    edge: Int[Tensor, " m"]
+    fraction: Float[Tensor, " m"]
     weight: Float[Tensor, " m"]
     count: int
+
+    @property
+    def parts(self) -> list[slice]:
+        """Where the samples of each trajectory are."""
+        ends = torch.bincount(self.trajectory, minlength=self.count).cumsum(0).tolist()
+        return list(starmap(slice, pairwise([0, *ends])))
 
     def total(self, values: Float[Tensor, " m"]) -> Float[Tensor, " b"]:
         """Return the sum of the samples' values for each trajectory."""
@@ -224,39 +230,30 @@ def sample_paths(
     if time == 1:
         weight = torch.ones_like(weight)
     rows = q.reshape(-1, dof)[edge] + fraction[:, None] * delta.reshape(-1, dof)[edge]
-    return Samples(rows, edge // time, weight, trajectories)
+    return Samples(rows, edge // time, edge % time, fraction, weight, trajectories)
 
 
 def _parts(
-    robot: Any,
-    q: Float[Tensor, "b time dof"],
-    delta: Float[Tensor, "b steps dof"],
-    subdivision: Subdivision,
-    centers_of: Callable[[Tensor], Tensor] | None,
+    robot: Any, q: Tensor, delta: Tensor, subdivision: Subdivision, centers_of: Any
 ) -> Int[Tensor, "b steps"]:
     if subdivision.parts is not None or delta.shape[1] == 0:
         return delta.new_full(delta.shape[:2], subdivision.parts or 0, dtype=torch.int64)
+    arrays = robot.arrays
     with torch.no_grad():
         centers = (centers_of or robot.sphere_centers)(q.reshape(-1, q.shape[-1]))
     centers = centers.reshape(*q.shape[:2], *centers.shape[1:])
     way = centers.diff(dim=1).square().sum(dim=-1).amax(dim=-1).sqrt()
-    turning = torch.as_tensor(_turning(robot), device=q.device)
+    turning = torch.zeros(q.shape[-1], dtype=torch.bool, device=q.device)
+    turning[torch.as_tensor(arrays.q_index[arrays.kind == 1], device=q.device)] = True
     turn = torch.where(turning, delta.abs(), 0.0).amax(dim=-1)
     wanted = torch.maximum(way / subdivision.spacing, turn / MAX_TURN)
     return wanted.clamp(max=MAX_PARTS).ceil().clamp(min=1).long()
 
 
-def _turning(robot: Any) -> np.ndarray:
-    """Which joints (dof,) turn something."""
-    turns = np.zeros(robot.dof, dtype=np.bool_)
-    turns[robot.arrays.q_index[robot.arrays.kind == 1]] = True
-    return turns
-
-
 # --- compiled kernels on the CPU --------------------------------------------------------
 
-# (waypoints, change along each edge, parts of each edge, gradient to add to) -> cost
-Kernel = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], float]
+# (gradient to add to, and of the samples q, edge, fraction, weight) -> cost
+Kernel = Callable[..., float]
 Plain = Callable[[Tensor], Tensor]
 Pull = Callable[[np.ndarray], np.ndarray]
 Work = Callable[[np.ndarray], tuple[np.ndarray, Pull]]
@@ -266,49 +263,29 @@ _ROWS_AT_ONCE = 512
 
 
 class PathKernels:
-    """A robot packed for the kernels, and how its edges are divided.
+    """A robot packed for the kernels; `rules`: see `pack_robot`.
 
     Its functions raise RobotError where q is not finite.
-
-    Args:
-        robot: the robot.
-        subdivision: of the edges.
-        rules: (links,) which field each link is compared with; see `pack_robot`.
     """
 
-    def __init__(
-        self, robot: Any, subdivision: Subdivision, rules: Int[np.ndarray, " l"] | None = None
-    ) -> None:
+    def __init__(self, robot: Any, rules: Int[np.ndarray, " l"] | None = None) -> None:
         packed = pack_robot(robot.arrays, rules=rules)
-        self.floats, self.ints = packed.floats, packed.ints
-        self._robot, self._subdivision = robot, subdivision
-        self._turns = _turning(robot)
+        self.floats, self.ints, self._robot = packed.floats, packed.ints, robot
 
-    def _divide(
-        self, Q: Float[np.ndarray, "time dof"]
-    ) -> tuple[Float[np.ndarray, "steps dof"], Int[np.ndarray, " steps"]]:
-        """Change of the joints along each edge, and into how many it is divided."""
-        delta, division = np.diff(Q, axis=0), self._subdivision
-        parts = np.full(len(delta), division.parts or 1, dtype=np.int64)
-        if division.parts is None and len(delta):
-            kernels.subdivide(
-                Q, delta, self.floats, self.ints, self._turns,
-                division.spacing, MAX_TURN, MAX_PARTS, parts,
-            )  # fmt: skip
-        return delta, parts
-
-    def __call__(
-        self, q: Float[Tensor, "b time dof"], kernel: Kernel, plain: Plain
+    def costs(
+        self, q: Float[Tensor, "b time dof"], samples: Samples, kernel: Kernel, plain: Plain
     ) -> Float[Tensor, " b"]:
         """Return the cost of each trajectory; second derivatives are those of `plain`."""
         _require_finite(q)
+        own = (samples.q, samples.edge, samples.fraction, samples.weight)
+        arrays, parts = [values.detach().numpy() for values in own], samples.parts
 
         def work(Q: np.ndarray) -> tuple[np.ndarray, Pull]:
             values, grad = np.empty(len(Q)), np.zeros(Q.shape)
 
-            def piece(part: slice) -> None:
-                for b in range(part.start, part.stop):
-                    values[b] = kernel(Q[b], *self._divide(Q[b]), grad[b])
+            def piece(some: slice) -> None:
+                for b in range(some.start, some.stop):
+                    values[b] = kernel(grad[b], *(array[parts[b]] for array in arrays))
 
             run_chunked(piece, len(Q), _AT_ONCE)
             return values, lambda output: output[:, None, None] * grad
@@ -356,17 +333,6 @@ def _require_finite(q: Tensor) -> None:
         raise RobotError("q holds NaN or infinite values; give finite joint values")
 
 
-def compiled(x: Tensor, work: Work, plain: Plain) -> Tensor:
-    """Return what `work` makes of an array, as a function of the tensor x on the CPU.
-
-    Args:
-        x: any float dtype; `work` gets float64.
-        work: returns a value and what pulls a gradient of it back to x.
-        plain: the same in torch, which is asked for second derivatives.
-    """
-    return _Compiled.apply(x, work, plain)
-
-
 def compiled_per_sphere(
     centers: Float[Tensor, "m s 3"],
     fill: Callable[[np.ndarray, np.ndarray, np.ndarray], None],
@@ -383,7 +349,11 @@ def compiled_per_sphere(
 
 
 class _Compiled(torch.autograd.Function):
-    """Value and gradient from kernels; differentiated twice, it is the plain graph instead."""
+    """What `work` makes of an array, as a function of a tensor of any float dtype on the CPU.
+
+    `work` gets float64, and returns a value and what pulls a gradient of it back; `plain`, the
+    same in torch, is asked for second derivatives.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, work: Work, plain: Plain) -> Tensor:
@@ -402,3 +372,6 @@ class _Compiled(torch.autograd.Function):
             pulled = ctx.pull(output.to(torch.float64).contiguous().numpy())
             found = torch.from_numpy(pulled).to(x.dtype)
         return found, None, None
+
+
+compiled = _Compiled.apply

@@ -57,12 +57,7 @@ class _PosteriorCost(SphereCost):
     Where the kernel mass s is small, the map repeats its prior: readings count by
     1 - exp(-s / min_support), so not at all where no kernel reaches.
 
-    Args:
-        scene: the map, and what may be touched there.
-        reading: what to read.
-        exact: True asks the posterior itself; False a quadratic B-spline of its values.
-        resolution: of that spline's nodes, metres.
-        options: see `SphereCost`.
+    `exact`, `resolution`: see `OccupancyCost`; the options are those of `SphereCost`.
     """
 
     def __init__(
@@ -141,14 +136,12 @@ class _PosteriorCost(SphereCost):
         first = np.floor(lower / resolution).astype(np.int64) - 2
         shape = np.ceil(upper / resolution).astype(np.int64) + 3 - first
         values = np.empty((len(self._free), *shape), dtype=np.float32)
-        slab = np.moveaxis(np.indices((1, int(shape[1]), int(shape[2]))), 0, -1).reshape(-1, 3)
-        step = max(1, _AT_ONCE // len(slab))
+        step = max(1, _AT_ONCE // int(shape[1] * shape[2]))
         for start in range(0, int(shape[0]), step):
             part = values[:, start : start + step]
-            nodes = np.concatenate(
-                [slab + np.array([start + i, 0, 0]) for i in range(part.shape[1])]
-            )
-            read = self._map.log_proba_and_support(resolution * (nodes + first))
+            nodes = np.moveaxis(np.indices(part.shape[1:]), 0, -1).reshape(-1, 3)
+            nodes = nodes + first + np.array([start, 0, 0])
+            read = self._map.log_proba_and_support(resolution * nodes)
             log_p, support = map(torch.from_numpy, read)
             counts = self._counts(support)
             for own, free in zip(part, self._free, strict=True):
@@ -170,7 +163,8 @@ class OccupancyCost(_PosteriorCost):
     Both are weighted by 1 - exp(-s / min_support), s the kernel mass: where no kernel reaches,
     the map has nothing to say. The hazard does not saturate: where P rounds to 1 its slope is
     that of the logit. Both follow the posterior's own hills and valleys, so the way out of an
-    object need not be downhill (for that there is `ClearanceCost`).
+    object need not be downhill (for that there is `ClearanceCost`). Links that no joint moves
+    are left out.
 
     With a `VPrismMap`, only its objects count. With a `World` or a `CollisionChecker`, so
     does what is an obstacle whatever the posterior says (`World.certain_field`, support
@@ -252,11 +246,9 @@ class EntropyCost(_PosteriorCost):
     """How unsure the map is of the space that the robot passes through.
 
     The entropy of the class probabilities (nats), averaged over the ball of each sphere,
-    summed over spheres and averaged over time, or with `arc_length` integrated over the way
-    of the sphere's centre; weighted by kernel mass as in `OccupancyCost`. It is a matter of the
-    map alone, whatever it is given: obstacles do not enter. It is highest on the surfaces of
-    objects and falls on both sides of them, so it says nothing of collisions: add
-    `ClearanceCost` or `RiskCost`.
+    summed and averaged as in `OccupancyCost`. It is a matter of the map alone, whatever it is
+    given: obstacles do not enter. It is highest on the surfaces of objects and falls on both
+    sides of them, so it says nothing of collisions: add `ClearanceCost` or `RiskCost`.
 
     Args:
         world, robot, exact, arc_length, spacing, subsamples, resolution, backend: see

@@ -2,6 +2,7 @@
 """The cost of colliding in worlds drawn from the posterior."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,11 +43,9 @@ class _DrawField:
     Distances are cut off so far beyond it that the spline is itself up to there.
 
     Attributes:
-        steps: (rules, nx, ny, nz, S) int16: distance in multiples of `unit`, one table per
-            contact rule.
+        steps: (rules, nx, ny, nz, S) int16: distance in multiples of `unit` metres.
         blocks: (rules, bx, by, bz) least distance of any draw; see `block_least`.
         grid: origin and spacing, metres.
-        unit: metres.
 
     Args:
         worlds: the draws.
@@ -171,17 +170,13 @@ class RiskCost(SphereCost):
     Where all draws are hit, P is 1 and flat, but the cost is not: it grows by 1 / tau per metre
     of depth in the draw that is hit least. For small risk it equals P.
 
-    With a `World` or a `CollisionChecker`, what is an obstacle whatever the posterior says
-    (`World.certain_field`, support surface, half-spaces) is so in every draw; with a
-    `VPrismMap` only its objects count. A checker's margin counts as part of the spheres, and
-    objects that a link may touch are left out for it. Links that no joint moves do not count.
+    What is certain (see `OccupancyCost`) is an obstacle in every draw.
 
     The draws are baked: signed distances on nodes, 2 bytes per node and draw, read by the
     spline of `ClearanceCost` and erring to contact by the same bound. Baking takes seconds.
 
     Args:
-        world: a `VPrismMap`, a `World` or a `CollisionChecker`.
-        robot: the robot; a checker brings its own.
+        world, robot: see `OccupancyCost`.
         n_worlds: S, a multiple of 64.
         seed: of the draws. An estimate of the result needs another seed, as `plan` does.
         temperature: tau, metres, above 0.
@@ -233,20 +228,17 @@ class RiskCost(SphereCost):
         samples, centers = self._spheres(q, fast)
         if fast is None:
             return self._plain(centers, samples)
-        return compiled(
-            centers, lambda x: self._losses(x, samples), lambda x: self._plain(x, samples)
-        )
+        work = partial(self._losses, samples=samples)
+        return compiled(centers, work, partial(self._plain, samples=samples))
 
     def _losses(self, centers: np.ndarray, samples: Samples) -> tuple[np.ndarray, Pull]:
-        owner = samples.trajectory.numpy()
-        starts = np.searchsorted(owner, np.arange(samples.count + 1))
         losses, force = np.empty(samples.count), np.zeros(centers.shape)
         draws, certain = self._draws, _NOTHING if self._certain is None else self._certain
-        packed = certain.packed(0.0, 0.0, self._planes)
+        packed, parts = certain.packed(0.0, 0.0, self._planes), samples.parts
 
-        def piece(part: slice) -> None:
-            for b in range(part.start, part.stop):
-                own = slice(starts[b], starts[b + 1])
+        def piece(some: slice) -> None:
+            for b in range(some.start, some.stop):
+                own = parts[b]
                 losses[b] = kernels.risk(
                     centers[own], self._rules, self._grown, self._radii, draws.steps,
                     draws.blocks, draws.grid, draws.unit, certain.values, certain.blocks, packed,
@@ -254,6 +246,7 @@ class RiskCost(SphereCost):
                 )  # fmt: skip
 
         run_chunked(piece, len(losses), 4)
+        owner = samples.trajectory.numpy()
         return losses, lambda output: output[owner, None, None] * force
 
     def _plain(self, centers: Float[Tensor, "m s 3"], samples: Samples) -> Float[Tensor, " b"]:

@@ -48,13 +48,12 @@ class Scene:
     """A robot among obstacles: those of a checker, of a world, or of a map alone.
 
     Attributes:
-        map, world: the map, and the world; None where there is only a map.
-        robot: the robot.
+        world: None where there is only a map.
         margin: metres that the checker wants spheres to keep.
         rules: sets of objects that may be touched, one per contact rule.
         link_rules, sphere_rules: (L,), (S,) the rule of each; -1 where no joint moves it: such
             links are not checked against the world.
-        radii: (S,) radii of the spheres with the checker's margin, metres.
+        radii: (S,) radii of the spheres with that margin, metres.
 
     Raises:
         ConfigError: a robot is missing, or another one than the checker's is given; or `world`
@@ -72,7 +71,7 @@ class Scene:
             robot, world = world.robot, world.world
         if robot is None:
             raise ConfigError("a world alone has no robot; pass one, or pass a CollisionChecker")
-        self.world = world if hasattr(world, "certain_field") else None
+        self.world: Any = world if hasattr(world, "certain_field") else None
         self.map = world if self.world is None else world.map
         if not hasattr(self.map, "log_proba_and_support"):
             raise ConfigError(
@@ -111,15 +110,8 @@ class SphereCost(TrajectoryCost):
     """A potential of each sphere, averaged over time or integrated over its centre's way.
 
     Subclasses implement `_potential`, or a `_kernel` of whole trajectories beside it, or
-    `_costs`. In a scene, only spheres that joints move count (`_checked`).
-
-    Args:
-        robot: the robot.
-        scene: it among obstacles, if they matter.
-        arc_length: whether to integrate over ways, metres, instead of averaging over time.
-        spacing, subsamples: see `Subdivision`.
-        backend: "auto" or "torch".
-        weight, name: see `TrajectoryCost`.
+    `_costs`. In a scene, only spheres that joints move count (`_checked`). For the arguments see
+    `ClearanceCost`.
     """
 
     _kernel: Any = None
@@ -150,7 +142,7 @@ class SphereCost(TrajectoryCost):
             rules = np.maximum(scene.link_rules, 0)
         self._compiled: PathKernels | None = None
         if choice("backend", backend, ("auto", "torch")) == "auto":
-            self._compiled = PathKernels(robot, self.subdivision, rules)
+            self._compiled = PathKernels(robot, rules)
 
     def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
         """Return the cost without its weight."""
@@ -158,7 +150,10 @@ class SphereCost(TrajectoryCost):
         flat = q.reshape(-1, *q.shape[-2:])
         fast = self._compiled if q.device.type == "cpu" else None
         if fast is not None and self._kernel is not None:
-            costs = fast(flat, self._kernel, partial(self._costs, fast=None))
+            rows = flat.detach().to(torch.float64)
+            samples = sample_paths(self.robot, rows, self.subdivision, fast.sphere_centers)
+            plain = partial(self._costs, fast=None)
+            costs = fast.costs(flat, samples, self._kernel, plain)
         else:
             costs = self._costs(flat, fast)
         return costs.reshape(q.shape[:-2])
@@ -213,18 +208,17 @@ class ClearanceCost(SphereCost):
 
     The gap to the baked obstacles comes from a quadratic B-spline of the signed distance
     (`SplineField`), less a radius so much larger that a positive gap proves the sphere free
-    at that configuration. Inside obstacles the gap falls with slope 1 towards the inside, as
-    far as they go: there is no depth at which the gradient is cut off. It is zero only on
-    ridges where several ways out are equally long. What lies between samples, and what was
-    seen outside the world's grid, is left to verification.
+    at that configuration. Inside obstacles the gap falls with slope 1 as far as they go; the
+    gradient is zero only on ridges where several ways out are equally long. What lies between
+    samples, and what was seen outside the world's grid, is left to verification.
 
     Args:
         world: a `World`, or a `CollisionChecker`.
         robot: the robot; a checker brings its own.
         margin: metres, above 0.
         arc_length: see above.
-        spacing: of samples, metres; see `Subdivision`.
-        subsamples: parts of every edge, instead of `spacing`.
+        spacing: the most that a sphere's centre moves between two samples, metres.
+        subsamples: parts of every edge, instead of `spacing`; at most 64.
         backend: "auto" uses compiled kernels on the CPU; "torch" never does.
         weight, name: see `TrajectoryCost`.
 
@@ -256,13 +250,11 @@ class ClearanceCost(SphereCost):
         self._packed = self._field.packed(margin, scene.margin, self._planes)
         self._both = scene.radii, grown(scene.radii, self._field.spacing)
 
-    def _kernel(
-        self, Q: np.ndarray, delta: np.ndarray, parts: np.ndarray, grad: np.ndarray
-    ) -> float:
+    def _kernel(self, grad: np.ndarray, *samples: np.ndarray) -> float:
         assert self._compiled is not None
         kernel = kernels.clearance_by_length if self.arc_length else kernels.clearance
         return kernel(
-            Q, delta, parts, self._compiled.floats, self._compiled.ints, self._field.values,
+            *samples, self._compiled.floats, self._compiled.ints, self._field.values,
             self._field.blocks, self._packed, *self._both, grad,
         )  # fmt: skip
 
@@ -328,14 +320,10 @@ class SelfCollisionCost(SphereCost):
             reach.append(both - arrays.link_padding[a] - arrays.link_padding[b])
         self._pairs, self._reach = np.concatenate(rows), np.concatenate(reach)
 
-    def _kernel(
-        self, Q: np.ndarray, delta: np.ndarray, parts: np.ndarray, grad: np.ndarray
-    ) -> float:
+    def _kernel(self, grad: np.ndarray, *samples: np.ndarray) -> float:
         assert self._compiled is not None
-        return kernels.self_collision(
-            Q, delta, parts, self._compiled.floats, self._compiled.ints, self.margin, self._kept,
-            grad,
-        )  # fmt: skip
+        robot = self._compiled.floats, self._compiled.ints
+        return kernels.self_collision(*samples, *robot, self.margin, self._kept, grad)
 
     def _potential(self, centers: Float[Tensor, "m s 3"], fast: bool) -> Float[Tensor, "m 1"]:
         pairs = torch.as_tensor(self._pairs, device=centers.device)
