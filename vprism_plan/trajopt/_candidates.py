@@ -121,7 +121,7 @@ def make_seeds(
 
 def _detour(
     checker: CheckerLike, straight: np.ndarray, number: int, rng: np.random.Generator
-) -> Float[np.ndarray, "t dof"]:
+) -> np.ndarray:
     """The way through a free configuration, found farther out with every number.
 
     Of random ones around the middle, it is the one with most of its two edges free, then
@@ -142,9 +142,7 @@ def _detour(
     return along(np.stack([a, best, b]), len(straight))
 
 
-def _noisy(
-    robot: Any, base: np.ndarray, number: int, rng: np.random.Generator
-) -> Float[np.ndarray, "t dof"]:
+def _noisy(robot: Any, base: np.ndarray, number: int, rng: np.random.Generator) -> np.ndarray:
     """A trajectory with smooth noise, more of it with every number."""
     basis = smooth_basis(len(base) - 2, 2)
     drawn = basis @ rng.standard_normal((len(basis), base.shape[1]))
@@ -378,9 +376,7 @@ class Candidates:
         self.verification_time += time.perf_counter() - began
         return first
 
-    def _judged(
-        self, judge: CheckerLike, path: Float[np.ndarray, "t dof"]
-    ) -> tuple[PlanResult, int]:
+    def _judged(self, judge: CheckerLike, path: np.ndarray) -> tuple[PlanResult, int]:
         """The verdict on a path, and the edge of it that is refused, -1 if none."""
         for edge, (a, b) in enumerate(pairwise(path)):
             self.motion_checks += 1
@@ -423,9 +419,7 @@ def _refusal(path: Float[np.ndarray, "t dof"], edge: int, why: str, report: Any)
     )
 
 
-def path_clearance(
-    checker: Any, path: Float[np.ndarray, "t dof"], step: float
-) -> tuple[float, float]:
+def path_clearance(checker: Any, path: np.ndarray, step: float) -> tuple[float, float]:
     """Return the smallest clearance on a path (else of samples of it), metres, and its place."""
     if hasattr(checker, "min_clearance"):
         answer = checker.min_clearance(path)

@@ -27,8 +27,7 @@ class SplineField:
     The weights are positive, sum to 1, average to the point and have the variance h^2 / 4
     per axis. So linear functions are reproduced, and where the nodes hold distances d_i to a
     set, |x|^2 - d(x)^2 being convex, the value D obeys D(x)^2 <= d(x)^2 + 3 h^2 / 4: it
-    exceeds a distance by at most that (see `grown`). There is no flat cell on the ridge
-    between two equal nodes, as linear interpolation has.
+    exceeds a distance by at most that (see `grown`).
 
     Outside the grid, a metres from its nearest point c: min(D(c), 0) + hypot(s a, max(D(c), 0)),
     which continues distances outwards, with s = 1 where D(c) >= h, falling to 1/2 at 0: where a
@@ -145,9 +144,8 @@ def grown(radii: Float[np.ndarray, " s"], spacing: float) -> Float[np.ndarray, "
 def union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> SplineField:
     """Signed distance to fields' obstacles and half-spaces together, one per contact rule.
 
-    Where an object stands on a table, the way out of the object is not down into the
-    table: depth is the distance to what is outside of both. Without this, the pull of the
-    object's underside and the push of the table cancel.
+    Depth is the distance to what is outside of both: where an object stands on a table, the
+    pull of its underside and the push of the table would cancel.
     """
     field = fields[0]
     key = np.asarray(planes, dtype=np.float64).tobytes()
@@ -166,11 +164,8 @@ def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spl
     x, y, z = (n + 2 for n in field.distance.shape)
     # One more node all around: space outside the grid is a way out of what touches its faces.
     grid = Grid(spacing, first, (x, y, z))
-    rim = np.zeros(grid.shape, dtype=np.float32)
-    for axis, n in enumerate(grid.shape):
-        ends = np.zeros(n, dtype=np.float32)
-        ends[[0, -1]] = spacing**2
-        rim += ends.reshape([-1 if a == axis else 1 for a in range(3)])
+    ends = [np.float32(spacing**2) * np.isin(np.arange(n), [0, n - 1]) for n in grid.shape]
+    rim = ends[0][:, None, None] + ends[1][:, None] + ends[2]
     floor = np.full(grid.shape, np.inf, dtype=np.float32)
     for start in range(0, x, 16):
         part = floor[start : start + 16]

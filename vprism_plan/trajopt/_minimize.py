@@ -35,9 +35,8 @@ class Limits:
 
     Attributes:
         iterations: at most, per row.
-        tolerance: relative decrease below which an iteration counts as none; a row ends
-            after some such in a row, or where no component of its gradient exceeds
-            `tolerance` squared times the first one's.
+        tolerance: relative decrease below which an iteration counts as none; a row ends after
+            some such, or where its gradient's maximum is below `tolerance`^2 times the first.
         deadline: value of `time.perf_counter` after which nothing more is evaluated.
     """
 
@@ -94,14 +93,9 @@ class Minimum:
 def lbfgs(evaluate: Evaluate, x: Tensor, limits: Limits) -> Minimum:
     """Minimise every row by L-BFGS (Nocedal 1980) with a weak Wolfe line search.
 
-    The line search is bisection (Lewis and Overton 2013), which does not ask for
-    smoothness: costs with hinges have kinks.
-
-    Args:
-        evaluate: see `Evaluate`; may return values that are not finite, which only
-            shortens the step. A row whose first gradient is not finite stalls there.
-        x: (S, n) where to begin.
-        limits: when to end.
+    The line search is bisection (Lewis and Overton 2013), which does not ask for smoothness:
+    costs with hinges have kinks. Values that are not finite only shorten the step; a row whose
+    first gradient is not finite stalls there.
     """
     x = x.detach().clone()
     value, slope = evaluate(x, torch.arange(len(x)))
@@ -210,8 +204,7 @@ class _Lines:
 def adam(evaluate: Evaluate, x: Tensor, limits: Limits) -> Minimum:
     """Minimise every row by `torch.optim.Adam`, whose steps do not mix the rows.
 
-    The step falls as a cosine over the iterations. Each row ends by itself and keeps the best
-    point it saw.
+    The step falls as a cosine. Each row ends by itself and keeps the best point it saw.
     """
     point = x.detach().clone().requires_grad_()
     optimizer = torch.optim.Adam([point], lr=_RATE)

@@ -122,9 +122,8 @@ class SumCost(TrajectoryCost):
 
     def terms(self, q: Float[Tensor, "*batch time dof"]) -> dict[str, Any]:
         """Return each weighted cost of each trajectory."""
-        return {
-            name: self.weight * cost(q) for name, cost in zip(self._names, self.costs, strict=True)
-        }
+        named = zip(self._names, self.costs, strict=True)
+        return {name: self.weight * cost(q) for name, cost in named}
 
 
 # --- samples along trajectories ---------------------------------------------------------
@@ -190,7 +189,7 @@ class Samples:
         squares = centers.diff(dim=0).square().sum(dim=-1) + SHORT**2
         way = 0.5 * (squares.sqrt() - SHORT)
         joined = (self.trajectory[1:] == self.trajectory[:-1])[:, None]
-        way = torch.where(joined, way, torch.zeros_like(way))
+        way = torch.where(joined, way, 0.0)
         none = way.new_zeros(1, centers.shape[1])
         return torch.cat([way, none]) + torch.cat([none, way])
 
@@ -272,10 +271,8 @@ class PathKernels:
         packed = pack_robot(robot.arrays, rules=rules)
         self.floats, self.ints, self._robot = packed.floats, packed.ints, robot
 
-    def costs(
-        self, q: Float[Tensor, "b time dof"], samples: Samples, kernel: Kernel, plain: Plain
-    ) -> Float[Tensor, " b"]:
-        """Return the cost of each trajectory; second derivatives are those of `plain`."""
+    def costs(self, q: Tensor, samples: Samples, kernel: Kernel, plain: Plain) -> Tensor:
+        """Return costs (b,) of trajectories; second derivatives are those of `plain`."""
         _require_finite(q)
         own = (samples.q, samples.edge, samples.fraction, samples.weight)
         arrays, parts = [values.detach().numpy() for values in own], samples.parts

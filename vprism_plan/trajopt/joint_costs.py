@@ -25,10 +25,9 @@ class SmoothnessCost(TrajectoryCost):
 
         sum_t |D^n q_t|^2 / h^(2 n - 1),
 
-    the integral of the squared n-th derivative: it does not depend on how many waypoints
-    a trajectory has. rad^2 / s for velocity, rad^2 / s^3 and rad^2 / s^5 for the others;
-    metres instead of radians for sliding joints. A trajectory with too few waypoints for
-    a difference has none of it. O(T dof).
+    the integral of the squared n-th derivative, whatever the number of waypoints: rad^2 / s,
+    rad^2 / s^3 and rad^2 / s^5; metres for sliding joints. A trajectory with too few waypoints
+    for a difference has none of it. O(T dof).
 
     Args:
         velocity, acceleration, jerk: factors of the terms.
@@ -130,8 +129,7 @@ class PoseCost(TrajectoryCost):
         w_p |t(q) - t*|^2 + w_r 2 (1 - cos angle(R(q), R*)),
 
     metres^2 and, for small angles, radians^2: the second term is half the squared Frobenius
-    distance of the rotations, smooth everywhere. Its gradient falls to 0 half a turn away, where
-    all ways back are equally long.
+    distance of the rotations. Its gradient falls to 0 half a turn away.
 
     Args:
         robot: the robot.

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -108,9 +108,8 @@ class OptimizeReport:
             for an initial path that is returned as it was given.
         rounds: how many times the trajectories were optimised.
         evaluations: trajectories whose cost and gradient were computed.
-        optimization_time: seconds spent on that.
-        verification_time: seconds spent checking edges.
-        total_time: seconds, everything included.
+        optimization_time, verification_time, total_time: seconds spent on that, on checking
+            edges, and on everything.
         motion_checks: motions that were checked.
         cost: of the winner, NaN without one.
         path_length: Euclidean length of the path in joint space, NaN without one.
@@ -118,7 +117,6 @@ class OptimizeReport:
         min_clearance: smallest clearance, metres, NaN without a path: of the whole path if
             `keep_clearance` asked for it and the checker can say, else at
             `clearance_samples` samples of it.
-        clearance_samples: number of those samples.
         kept_clearance: the clearance that the path had to keep, metres; None if none.
         certified, tolerance, shares, risk, risk_levels, risk_time: as in `PlanReport`.
     """
@@ -214,9 +212,9 @@ def default_cost(checker: Any, kept: float | None = None) -> TrajectoryCost:
 
     Squared velocity (which makes paths short and waypoints even) and a little acceleration,
     plus clearance, self-collision and joint limits, each with a margin beyond what the
-    checker refuses, so that a converged trajectory passes. If the checker bounds risk, the
-    objects of the map enter as `RiskCost`, in the draws that edges are checked with: instead,
-    or beside their level set where the bound is below the world's `level`.
+    checker refuses. If the checker bounds risk, the objects of the map enter as `RiskCost`, in
+    the draws that edges are checked with: instead, or beside their level set where the bound is
+    below the world's `level`.
 
     Args:
         checker: a `CollisionChecker`; its margins, allowed contacts and bound on risk count.
@@ -225,46 +223,36 @@ def default_cost(checker: Any, kept: float | None = None) -> TrajectoryCost:
     Raises:
         PlanningError: the checker is something else.
     """
-    return _Defaults(checker, kept).cost()
+    return _default_costs(checker, kept)(0)
 
 
-class _Defaults:
-    """The default cost of a checker, and what repairs add to it; see `default_cost`."""
+def _default_costs(checker: Any, kept: float | None) -> Callable[[int], TrajectoryCost]:
+    """The default cost as level 0; from 1, what repairs add: all but smoothness, from farther."""
+    if not isinstance(checker, CollisionChecker):
+        raise PlanningError(
+            f"there is no default cost for a {type(checker).__name__}; pass `cost`, or use "
+            "a CollisionChecker"
+        )
+    config, robot = checker.config, checker.robot
+    beyond = 0.0 if kept is None else kept - float(config.margin)
+    margin = max(_MARGIN, beyond + 0.5 * _MARGIN)
 
-    def __init__(self, checker: Any, kept: float | None) -> None:
-        if not isinstance(checker, CollisionChecker):
-            raise PlanningError(
-                f"there is no default cost for a {type(checker).__name__}; pass `cost`, or use "
-                "a CollisionChecker"
-            )
-        self._checker = checker
-        beyond = 0.0 if kept is None else kept - float(checker.config.margin)
-        self._margin = max(_MARGIN, beyond + 0.5 * _MARGIN)
-
-    def cost(self) -> TrajectoryCost:
-        smooth = SmoothnessCost(velocity=1.0, acceleration=_BEND, robot=self._checker.robot)
-        return SumCost(smooth, *self._keep_off(self._margin))
-
-    def guard(self, level: int) -> TrajectoryCost:
-        """What repair number `level`, from 1, adds: all but smoothness, from farther away."""
-        return SumCost(*self._keep_off(self._margin + _GROWTH * level))
-
-    def _keep_off(self, margin: float) -> list[TrajectoryCost]:
-        checker = self._checker
-        return [
-            ClearanceCost(checker, margin=margin, weight=_CLEAR),
-            *self._risk,
-            SelfCollisionCost(checker, margin=_APART, weight=_OWN),
-            JointLimitCost(checker.robot, margin=_LIMITS, weight=_WITHIN),
-        ]
-
-    @cached_property
-    def _risk(self) -> list[TrajectoryCost]:
+    @cache
+    def risk(bound: float) -> TrajectoryCost:
         """What stands for the map's objects where the checker judges them by draws."""
-        config = self._checker.config
-        if config.max_risk is None:
-            return []
-        return [RiskCost(self._checker, seed=config.risk_seed, weight=_RISK / config.max_risk)]
+        return RiskCost(checker, seed=config.risk_seed, weight=_RISK / bound)
+
+    def cost(level: int) -> TrajectoryCost:
+        smooth = SmoothnessCost(velocity=1.0, acceleration=_BEND, robot=robot)
+        return SumCost(
+            *([smooth] if level == 0 else []),
+            ClearanceCost(checker, margin=margin + _GROWTH * level, weight=_CLEAR),
+            *([] if config.max_risk is None else [risk(config.max_risk)]),
+            SelfCollisionCost(checker, margin=_APART, weight=_OWN),
+            JointLimitCost(robot, margin=_LIMITS, weight=_WITHIN),
+        )
+
+    return cost
 
 
 def optimize(
@@ -407,9 +395,9 @@ def _costs(
             )
     guards = None if guard is None else lambda _: guard
     if cost is None or (guard is None and isinstance(checker, CollisionChecker)):
-        defaults = _Defaults(checker, kept)
-        cost = defaults.cost() if cost is None else cost
-        guards = defaults.guard if guards is None else guards
+        defaults = _default_costs(checker, kept)
+        cost = defaults(0) if cost is None else cost
+        guards = guards or defaults
     return cost, guards
 
 

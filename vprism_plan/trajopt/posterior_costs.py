@@ -12,7 +12,7 @@ from vprism_plan._arguments import choice, number
 from vprism_plan._kernels import trajopt as kernels
 from vprism_plan.trajopt._field import SplineField, grown, union_field
 from vprism_plan.trajopt.cost import compiled_per_sphere
-from vprism_plan.trajopt.sphere_costs import Scene, SphereCost, soft_contact
+from vprism_plan.trajopt.sphere_costs import SceneCost, soft_contact
 
 MEASURES = ("hazard", "probability")
 
@@ -51,28 +51,26 @@ def _entropy(log_p: Float[Tensor, "n k"], free: Bool[Tensor, " k"]) -> Float[Ten
     return -(log_p.exp() * log_p).sum(dim=1)
 
 
-class _PosteriorCost(SphereCost):
+class _PosteriorCost(SceneCost):
     """A reading of the map's posterior, averaged over spheres by a quadrature of 15 points.
 
     Where the kernel mass s is small, the map repeats its prior: readings count by
-    1 - exp(-s / min_support), so not at all where no kernel reaches.
-
-    `exact`, `resolution`: see `OccupancyCost`; the options are those of `SphereCost`.
+    1 - exp(-s / min_support), so not at all where no kernel reaches. See `OccupancyCost`.
     """
 
     def __init__(
-        self, scene: Scene, reading: Any, *, exact: bool, resolution: float, **options: Any
+        self, world: Any, robot: Any, reading: Any, exact: bool, resolution: float, **options: Any
     ) -> None:
-        super().__init__(scene.robot, scene, **options)
+        super().__init__(world, robot, **options)
         self.exact = bool(exact)
         step = number("resolution", resolution, 0.0, unit="metres", above=True)
-        least = _MIN_SUPPORT if scene.world is None else scene.world.config.min_support
-        self._map, self._reading = scene.map, reading
+        least = _MIN_SUPPORT if self._world is None else self._world.config.min_support
+        self._reading = reading
         self._min_support = max(float(least), 1e-6)
-        ids = [None, *scene.map.object_ids]
-        self._free = np.array([[k is None or k in gone for k in ids] for gone in scene.rules])
+        ids = [None, *self._map.object_ids]
+        self._free = np.array([[k is None or k in gone for k in ids] for gone in self._allowed])
         self._nodes, self._weights = ball_quadrature()
-        self._box = tuple(np.asarray(end, dtype=np.float64) for end in scene.map.support_bounds())
+        self._box = tuple(np.asarray(end, dtype=np.float64) for end in self._map.support_bounds())
         self._baked: SplineField | None = None
         if not self.exact and np.isfinite(self._box[0]).all():
             self._baked = self._bake(step)
@@ -203,16 +201,15 @@ class OccupancyCost(_PosteriorCost):
         name: str = "occupancy",
     ) -> None:
         choice("measure", measure, MEASURES)
-        scene = Scene(world, robot)
         super().__init__(
-            scene, _hazard if measure == "hazard" else _occupancy, exact=exact,
-            resolution=resolution, arc_length=arc_length, spacing=spacing,
-            subsamples=subsamples, backend=backend, weight=weight, name=name,
+            world, robot, _hazard if measure == "hazard" else _occupancy, exact, resolution,
+            arc_length=arc_length, spacing=spacing, subsamples=subsamples, backend=backend,
+            weight=weight, name=name,
         )  # fmt: skip
         self.measure = measure
         self._certain: SplineField | None = None
-        if scene.world is not None:
-            self._certain = union_field(scene.certain_fields(), self._planes)
+        if self._world is not None:
+            self._certain = union_field(self._certain_fields(), self._planes)
             self._softness = _SOFTNESS * self._certain.spacing
             self._grown = grown(self._radii, self._certain.spacing)
 
@@ -274,7 +271,6 @@ class EntropyCost(_PosteriorCost):
         name: str = "entropy",
     ) -> None:
         super().__init__(
-            Scene(world, robot), _entropy, exact=exact, resolution=resolution,
-            arc_length=arc_length, spacing=spacing, subsamples=subsamples, backend=backend,
-            weight=weight, name=name,
+            world, robot, _entropy, exact, resolution, arc_length=arc_length, spacing=spacing,
+            subsamples=subsamples, backend=backend, weight=weight, name=name,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from vprism_plan._arguments import number
@@ -22,7 +22,7 @@ from vprism_plan.trajopt._field import (
     union_field,
 )
 from vprism_plan.trajopt.cost import PathKernels, Pull, Samples, compiled
-from vprism_plan.trajopt.sphere_costs import Scene, SphereCost
+from vprism_plan.trajopt.sphere_costs import SceneCost
 from vprism_plan.world import PosteriorWorlds
 from vprism_plan.world.distance import Lattice, NodeDistances, distance_to_lattice, finish
 from vprism_plan.world.grid import Grid
@@ -114,13 +114,8 @@ class _DrawField:
         self.blocks = block_least(self.steps.min(axis=4) * np.float32(self.unit))
         self.grid = np.array([*grid.origin, h])
 
-    def near(
-        self,
-        centers: Float[Tensor, "m s 3"],
-        rules: Int[np.ndarray, " s"],
-        enough: Float[np.ndarray, " s"],
-    ) -> tuple[Tensor, Tensor]:
-        """(sample, sphere) where a draw may be near enough to count."""
+    def near(self, centers: Tensor, rules: np.ndarray, enough: np.ndarray) -> tuple[Any, Any]:
+        """(sample, sphere) of centres (m, s, 3) where a draw may be nearer than enough (s,)."""
         grid = torch.as_tensor(self.grid).to(centers)
         top = torch.tensor(self.steps.shape[1:4], device=centers.device) - 1
         scaled = (centers - grid[:3]) / grid[3]
@@ -131,10 +126,8 @@ class _DrawField:
         near = least < torch.as_tensor(enough).to(centers)[columns]
         return rows[near], columns[near]
 
-    def distances(
-        self, points: Float[Tensor, "n 3"], rules: Int[np.ndarray, " n"], table: Tensor
-    ) -> Float[Tensor, "n d"]:
-        """Spline of every draw's signed distance, metres; `table` is `steps` by node."""
+    def distances(self, points: Tensor, rules: np.ndarray, table: Tensor) -> Tensor:
+        """Spline (n, S) of every draw's signed distance, metres; `table` is `steps` by node."""
         grid = torch.as_tensor(self.grid).to(points)
         sizes = self.steps.shape[1:4]
         around, weights = spline_weights((points - grid[:3]) / grid[3], sizes)
@@ -150,7 +143,7 @@ class _DrawField:
 _NOTHING = SplineField(np.full((1, 2, 2, 2), np.inf, np.float32), np.zeros(3), 1.0)
 
 
-class RiskCost(SphereCost):
+class RiskCost(SceneCost):
     """Relaxed probability of touching anything along the path, jointly over posterior draws.
 
     S worlds are drawn from the posterior once (`PosteriorWorlds`: draw s occupies a voxel
@@ -168,9 +161,8 @@ class RiskCost(SphereCost):
     8 tau, so that many distant spheres do not add up to a contact.
 
     Where all draws are hit, P is 1 and flat, but the cost is not: it grows by 1 / tau per metre
-    of depth in the draw that is hit least. For small risk it equals P.
-
-    What is certain (see `OccupancyCost`) is an obstacle in every draw.
+    of depth in the draw that is hit least. For small risk it equals P. What is certain (see
+    `OccupancyCost`) is an obstacle in every draw.
 
     The draws are baked: signed distances on nodes, 2 bytes per node and draw, read by the
     spline of `ClearanceCost` and erring to contact by the same bound. Baking takes seconds.
@@ -204,27 +196,37 @@ class RiskCost(SphereCost):
         weight: float = 1.0,
         name: str = "risk",
     ) -> None:
-        temperature = number("temperature", temperature, 0.0, unit="metres", above=True)
-        scene = Scene(world, robot)
         super().__init__(
-            scene.robot, scene, spacing=spacing, subsamples=subsamples, backend=backend,
-            weight=weight, name=name,
+            world, robot, spacing=spacing, subsamples=subsamples, backend=backend, weight=weight,
+            name=name,
         )  # fmt: skip
-        self.temperature, self._cut = temperature, _CUT * temperature
-        worlds = _worlds(scene, n_worlds, seed, resolution, float(self._radii.max(initial=0.0)))
+        self.temperature = number("temperature", temperature, 0.0, unit="metres", above=True)
+        self._cut = _CUT * self.temperature
+        worlds = self._worlds(n_worlds, seed, resolution)
         self._grown = grown(self._radii, worlds.resolution)
-        fields = scene.certain_fields()
+        fields = self._certain_fields()
         reach = float(self._grown.max(initial=0.0)) + self._cut
-        self._draws = _DrawField(worlds, scene.rules, fields, self._planes, reach)
+        self._draws = _DrawField(worlds, self._allowed, fields, self._planes, reach)
         self._certain = union_field(fields, self._planes) if fields else None
+
+    def _worlds(self, n_worlds: int, seed: int, resolution: float | None) -> PosteriorWorlds:
+        """The draws: the world's own, so that a checker's and a cost's are drawn once."""
+        own = 0.01 if self._world is None else float(self._world.field.spacing)
+        step = own if resolution is None else resolution
+        reach = max(float(self._radii.max(initial=0.0)) + _ROOM * step, 2.0 * step)
+        if self._world is None:
+            return PosteriorWorlds(self._map, n_worlds, seed, step, reach)
+        if step != own:
+            raise ConfigError(
+                f"resolution is {resolution}; a world's draws have its own, {own} m: leave it out"
+            )
+        return self._world.posterior_worlds(n_worlds, seed, reach=reach)
 
     def probability(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
         """Return P, the relaxed probability of touching anything."""
         return -torch.expm1(-self.evaluate(q))
 
-    def _costs(
-        self, q: Float[Tensor, "b time dof"], fast: PathKernels | None
-    ) -> Float[Tensor, " b"]:
+    def _costs(self, q: Tensor, fast: PathKernels | None) -> Tensor:
         samples, centers = self._spheres(q, fast)
         if fast is None:
             return self._plain(centers, samples)
@@ -278,20 +280,3 @@ class RiskCost(SphereCost):
         odds = torch.zeros_like(high).index_add(0, owner, grown_odds)
         loss = high + torch.log(torch.exp(-high) + odds)
         return -(torch.logsumexp(-loss, dim=1) - float(np.log(n_worlds)))
-
-
-def _worlds(
-    scene: Scene, n_worlds: int, seed: int, resolution: float | None, largest: float
-) -> PosteriorWorlds:
-    """The draws: the world's own, so that a checker's and a cost's are drawn once."""
-    world = scene.world
-    own = 0.01 if world is None else float(world.field.spacing)
-    step = own if resolution is None else resolution
-    reach = max(largest + _ROOM * step, 2.0 * step)
-    if world is None:
-        return PosteriorWorlds(scene.map, n_worlds, seed, step, reach)
-    if step != own:
-        raise ConfigError(
-            f"resolution is {resolution}; a world's draws have its own, {own} m: leave it out"
-        )
-    return world.posterior_worlds(n_worlds, seed, reach=reach)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from vprism_plan._arguments import choice, number
@@ -44,74 +44,11 @@ def soft_contact(depth: Float[Tensor, "*shape"], cut: float) -> Float[Tensor, "*
     return torch.nn.functional.softplus(depth, threshold=40.0) * kept.square()
 
 
-class Scene:
-    """A robot among obstacles: those of a checker, of a world, or of a map alone.
-
-    Attributes:
-        world: None where there is only a map.
-        margin: metres that the checker wants spheres to keep.
-        rules: sets of objects that may be touched, one per contact rule.
-        link_rules, sphere_rules: (L,), (S,) the rule of each; -1 where no joint moves it: such
-            links are not checked against the world.
-        radii: (S,) radii of the spheres with that margin, metres.
-
-    Raises:
-        ConfigError: a robot is missing, or another one than the checker's is given; or `world`
-            is none of the three.
-    """
-
-    def __init__(self, world: Any, robot: Any) -> None:
-        self._checker = world if isinstance(world, CollisionChecker) else None
-        if self._checker is not None:
-            if robot is not None and robot is not world.robot:
-                raise ConfigError(
-                    "a checker brings its own robot; leave `robot` out, or build a checker for "
-                    "this one"
-                )
-            robot, world = world.robot, world.world
-        if robot is None:
-            raise ConfigError("a world alone has no robot; pass one, or pass a CollisionChecker")
-        self.world: Any = world if hasattr(world, "certain_field") else None
-        self.map = world if self.world is None else world.map
-        if not hasattr(self.map, "log_proba_and_support"):
-            raise ConfigError(
-                f"got a {type(world).__name__}; pass a VPrismMap, a World or a CollisionChecker"
-            )
-        self.robot = robot
-        self.margin, arrays = 0.0, robot.arrays
-        allowed = [frozenset[int]()] * len(arrays.link_frame)
-        if self._checker is not None:
-            self.margin = float(self._checker.config.margin)
-            allowed = [self._checker.allowed_objects(link) for link in range(len(allowed))]
-        self.rules = tuple(dict.fromkeys(allowed))
-        index = np.array([self.rules.index(own) for own in allowed], dtype=np.int64)
-        self.link_rules = np.where(arrays.link_fixed, -1, index)
-        self.sphere_rules = self.link_rules[arrays.sphere_link]
-        self.radii = arrays.sphere_radius + self.margin
-
-    def fields(self) -> list[Any]:
-        """Return the distance field of each rule: the one verdicts are given by."""
-        if self._checker is None:
-            return [self.world.field]
-        found: list[Any] = [None] * len(self.rules)
-        for link in range(len(self.link_rules)):
-            rule = self.rules.index(self._checker.allowed_objects(link))
-            found[rule] = self._checker.verdict_field(link)
-        return found
-
-    def certain_fields(self) -> list[Any]:
-        """Return what is an obstacle whatever the posterior says, per rule; empty for a map."""
-        if self.world is None:
-            return []
-        return [self.world.certain_field(ids) for ids in self.rules]
-
-
 class SphereCost(TrajectoryCost):
     """A potential of each sphere, averaged over time or integrated over its centre's way.
 
     Subclasses implement `_potential`, or a `_kernel` of whole trajectories beside it, or
-    `_costs`. In a scene, only spheres that joints move count (`_checked`). For the arguments see
-    `ClearanceCost`.
+    `_costs`. For the arguments see `ClearanceCost`; `rules` are those of `pack_robot`.
     """
 
     _kernel: Any = None
@@ -119,7 +56,7 @@ class SphereCost(TrajectoryCost):
     def __init__(
         self,
         robot: Any,
-        scene: Scene | None = None,
+        rules: Int[np.ndarray, " l"] | None = None,
         *,
         spacing: float,
         subsamples: int | None,
@@ -132,14 +69,6 @@ class SphereCost(TrajectoryCost):
         self.robot, self.arc_length = robot, bool(arc_length)
         self.subdivision = Subdivision(spacing, subsamples)
         self._checked = np.arange(len(robot.arrays.sphere_radius))
-        self._planes = np.empty((0, 4))
-        rules = None
-        if scene is not None:
-            self._checked = (scene.sphere_rules >= 0).nonzero()[0]
-            self._rules = scene.sphere_rules[self._checked]
-            self._radii = scene.radii[self._checked]
-            self._planes = self._planes if scene.world is None else scene.world.planes.copy()
-            rules = np.maximum(scene.link_rules, 0)
         self._compiled: PathKernels | None = None
         if choice("backend", backend, ("auto", "torch")) == "auto":
             self._compiled = PathKernels(robot, rules)
@@ -158,19 +87,16 @@ class SphereCost(TrajectoryCost):
             costs = self._costs(flat, fast)
         return costs.reshape(q.shape[:-2])
 
-    def _costs(
-        self, q: Float[Tensor, "b time dof"], fast: PathKernels | None
-    ) -> Float[Tensor, " b"]:
+    def _costs(self, q: Tensor, fast: PathKernels | None) -> Tensor:
+        """Costs (b,) of (b, time, dof); with kernels, if there are any."""
         samples, centers = self._spheres(q, fast)
         values = self._potential(centers, fast is not None)
         if self.arc_length:
             return samples.total((values * samples.ways(centers)).sum(dim=1))
         return samples.total(samples.weight * values.sum(dim=1))
 
-    def _spheres(
-        self, q: Float[Tensor, "b time dof"], fast: PathKernels | None
-    ) -> tuple[Samples, Float[Tensor, "m s 3"]]:
-        """Samples, and the centres of the checked spheres at them."""
+    def _spheres(self, q: Tensor, fast: PathKernels | None) -> tuple[Samples, Tensor]:
+        """Samples, and the centres (m, s, 3) of the checked spheres at them."""
         if fast is not None:
             samples = sample_paths(self.robot, q, self.subdivision, fast.sphere_centers)
             return samples, fast.sphere_centers(samples.q, self._checked)
@@ -182,13 +108,60 @@ class SphereCost(TrajectoryCost):
         """Potential of each checked sphere; with kernels, if `fast`."""
         raise NotImplementedError(f"{type(self).__name__} has no potential of its spheres")
 
-    def _plane_gaps(self, centers: Float[Tensor, "m s 3"]) -> list[Float[Tensor, "m s"]]:
+
+class SceneCost(SphereCost):
+    """A cost of spheres among obstacles: those of a checker, of a world, or of a map alone.
+
+    Only spheres that joints move count: `_rules` (s,) are their contact rules, `_radii` (s,)
+    their radii with the checker's margin, metres. `_allowed` are the sets of objects that may be
+    touched, one per rule; `_world` is None where there is only a map.
+
+    Raises:
+        ConfigError: a robot is missing, or another one than the checker's is given; or `world`
+            is none of the three.
+    """
+
+    def __init__(self, world: Any, robot: Any, **options: Any) -> None:
+        checker = world if isinstance(world, CollisionChecker) else None
+        if checker is not None:
+            if robot is not None and robot is not checker.robot:
+                raise ConfigError("a checker brings its own robot; leave `robot` out")
+            robot, world = checker.robot, checker.world
+        if robot is None:
+            raise ConfigError("a world alone has no robot; pass one, or pass a CollisionChecker")
+        map_ = world.map if hasattr(world, "certain_field") else world
+        if not hasattr(map_, "log_proba_and_support"):
+            raise ConfigError(
+                f"got a {type(world).__name__}; pass a VPrismMap, a World or a CollisionChecker"
+            )
+        arrays = robot.arrays
+        allowed = [frozenset[int]()] * len(arrays.link_frame)
+        if checker is not None:
+            allowed = [checker.allowed_objects(link) for link in range(len(allowed))]
+        sets = tuple(dict.fromkeys(allowed))
+        index = np.array([sets.index(own) for own in allowed], dtype=np.int64)
+        super().__init__(robot, index, **options)
+        self._checker, self._world, self._map = checker, None if map_ is world else world, map_
+        self._allowed, self._link_rules = sets, index
+        self._room = 0.0 if checker is None else float(checker.config.margin)
+        self._checked = (~arrays.link_fixed[arrays.sphere_link]).nonzero()[0]
+        self._rules = index[arrays.sphere_link][self._checked]
+        self._radii = arrays.sphere_radius[self._checked] + self._room
+        self._planes = np.empty((0, 4)) if self._world is None else self._world.planes.copy()
+
+    def _certain_fields(self) -> list[Any]:
+        """What is an obstacle whatever the posterior says, per rule; empty for a map."""
+        if self._world is None:
+            return []
+        return [self._world.certain_field(ids) for ids in self._allowed]
+
+    def _plane_gaps(self, centers: Float[Tensor, "m s 3"]) -> list[Tensor]:
         radii = torch.as_tensor(self._radii).to(centers)
         planes = torch.as_tensor(self._planes).to(centers)
         return [centers @ row[:3] - row[3] - radii for row in planes]
 
 
-class ClearanceCost(SphereCost):
+class ClearanceCost(SceneCost):
     """How much the robot's spheres lack of a margin from all obstacles of a world.
 
     With e the gap of a sphere and c CHOMP's potential (c = 0 from `margin` on,
@@ -239,16 +212,22 @@ class ClearanceCost(SphereCost):
         weight: float = 1.0,
         name: str = "clearance",
     ) -> None:
-        margin = number("margin", margin, 0.0, unit="metres", above=True)
-        scene = Scene(world, robot)
         super().__init__(
-            scene.robot, scene, arc_length=arc_length, spacing=spacing, subsamples=subsamples,
+            world, robot, arc_length=arc_length, spacing=spacing, subsamples=subsamples,
             backend=backend, weight=weight, name=name,
         )  # fmt: skip
-        self.margin = margin
-        self._field = union_field(scene.fields(), self._planes)
-        self._packed = self._field.packed(margin, scene.margin, self._planes)
-        self._both = scene.radii, grown(scene.radii, self._field.spacing)
+        self.margin = number("margin", margin, 0.0, unit="metres", above=True)
+        self._field = union_field(self._verdict_fields(), self._planes)
+        self._packed = self._field.packed(self.margin, self._room, self._planes)
+        radii = self.robot.arrays.sphere_radius + self._room
+        self._both = radii, grown(radii, self._field.spacing)
+
+    def _verdict_fields(self) -> list[Any]:
+        """The distance field of each rule by which verdicts are given."""
+        if self._checker is None:
+            return [self._world.field]
+        first = [self._link_rules.tolist().index(rule) for rule in range(len(self._allowed))]
+        return [self._checker.verdict_field(link) for link in first]
 
     def _kernel(self, grad: np.ndarray, *samples: np.ndarray) -> float:
         assert self._compiled is not None
@@ -303,14 +282,14 @@ class SelfCollisionCost(SphereCost):
         weight: float = 1.0,
         name: str = "self-collision",
     ) -> None:
-        margin = number("margin", margin, 0.0, unit="metres", above=True)
         kept = 0.0
         if isinstance(robot, CollisionChecker):
             kept, robot = float(robot.config.self_margin), robot.robot
         super().__init__(
             robot, spacing=spacing, subsamples=subsamples, backend=backend, weight=weight, name=name
         )
-        self.margin, self._kept = margin, kept
+        self.margin = number("margin", margin, 0.0, unit="metres", above=True)
+        self._kept = kept
         arrays = robot.arrays
         rows, reach = [np.empty((0, 2), np.int64)], [np.empty(0)]
         for a, b in arrays.pairs:
