@@ -141,7 +141,8 @@ class SceneCost(SphereCost):
         sets = tuple(dict.fromkeys(allowed))
         index = np.array([sets.index(own) for own in allowed], dtype=np.int64)
         super().__init__(robot, index, **options)
-        self._checker, self._world, self._map = checker, None if map_ is world else world, map_
+        self._checker, self._map = checker, map_
+        self._world: Any = None if map_ is world else world
         self._allowed, self._link_rules = sets, index
         self._room = 0.0 if checker is None else float(checker.config.margin)
         self._checked = (~arrays.link_fixed[arrays.sphere_link]).nonzero()[0]
