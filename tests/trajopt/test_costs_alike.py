@@ -205,7 +205,7 @@ def test_refusals_name_the_value(arm_checker, arm):
         (lambda: OccupancyCost(7, arm), "got a int"),
         (lambda: RiskCost(arm_checker, temperature=0.0), "temperature is 0.0"),
         (lambda: RiskCost(arm_checker, resolution=0.02), "resolution is 0.02"),
-        (lambda: PoseCost(arm, "panda_hand", np.eye(3)), "pose is"),
+        (lambda: PoseCost(arm, "panda_hand", np.eye(3)), "pose has shape"),
         (lambda: SmoothnessCost(jerk=-1.0), "jerk is -1.0"),
         (SumCost, "at least one"),
     ):

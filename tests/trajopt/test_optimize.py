@@ -277,9 +277,9 @@ def test_continuous_joints_go_the_short_way_round():
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
-        ({"method": "newton"}, "lbfgs, adam"),
+        ({"method": "newton"}, "'lbfgs', 'adam'"),
         ({"seeds": 0}, "seeds is 0"),
-        ({"waypoints": 3}, "whole number from 4"),
+        ({"waypoints": 3}, "whole number, at least 4"),
         ({"max_iterations": 0}, "max_iterations is 0"),
         ({"tolerance": 0.0}, "tolerance is 0.0"),
         ({"time_limit": -1.0}, "time_limit is -1.0"),

@@ -45,6 +45,16 @@ def plan_steps(qa, qb, rf, ri, spacing, delta, link_rate):
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _voxel(T, f, x, y, z, spacing):
+    """A point of a frame in the world, voxels."""
+    return (
+        (T[f, 0] * x + T[f, 1] * y + T[f, 2] * z + T[f, 9]) / spacing,
+        (T[f, 3] * x + T[f, 4] * y + T[f, 5] * z + T[f, 10]) / spacing,
+        (T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]) / spacing,
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _away(gx, gy, gz, possible, corner):
     """Lower bound of the distance from a point to anything uncertain, voxels.
 
@@ -54,9 +64,7 @@ def _away(gx, gy, gz, possible, corner):
     gx = min(max(gx - corner[0], 0.0), possible.shape[0] - 1.0)
     gy = min(max(gy - corner[1], 0.0), possible.shape[1] - 1.0)
     gz = min(max(gz - corner[2], 0.0), possible.shape[2] - 1.0)
-    x = int(gx + 0.5)
-    y = int(gy + 0.5)
-    z = int(gz + 0.5)
+    x, y, z = int(gx + 0.5), int(gy + 0.5), int(gz + 0.5)
     off = np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
     return possible[x, y, z] - off
 
@@ -72,16 +80,12 @@ def _bound_ball(gx, gy, gz, need, distance_row, table, rows, lowest, scale, reac
     _, ex, ey, ez = distance_row.shape
     if not (0.0 <= gx <= ex - 1.0 and 0.0 <= gy <= ey - 1.0 and 0.0 <= gz <= ez - 1.0):
         return 0
-    x0 = min(int(gx), ex - 2)
-    y0 = min(int(gy), ey - 2)
-    z0 = min(int(gz), ez - 2)
+    x0, y0, z0 = min(int(gx), ex - 2), min(int(gy), ey - 2), min(int(gz), ez - 2)
     found = np.empty(8, np.int64)
     limits = np.empty(8, np.uint8)
     n = 0
     for corner in range(8):
-        x = x0 + (corner >> 2)
-        y = y0 + ((corner >> 1) & 1)
-        z = z0 + (corner & 1)
+        x, y, z = x0 + (corner >> 2), y0 + ((corner >> 1) & 1), z0 + (corner & 1)
         row = distance_row[table, x, y, z]
         if row < 0:
             return -1 if row == UNBAKED else 0
@@ -166,19 +170,14 @@ def sweep_draws(
             f = ri[li]
             bo = ri[18] + 4 * link
             # The bounding sphere first, then sphere by sphere.
-            bx, by, bz, clear = rf[bo], rf[bo + 1], rf[bo + 2], 0.0
-            gx = (T[f, 0] * bx + T[f, 1] * by + T[f, 2] * bz + T[f, 9]) / spacing
-            gy = (T[f, 3] * bx + T[f, 4] * by + T[f, 5] * bz + T[f, 10]) / spacing
-            gz = (T[f, 6] * bx + T[f, 7] * by + T[f, 8] * bz + T[f, 11]) / spacing
+            gx, gy, gz = _voxel(T, f, rf[bo], rf[bo + 1], rf[bo + 2], spacing)
             grown = bend + 0.5 * step
             clear = _away(gx, gy, gz, possible, corner) - (rf[bo + 3] + grown) / spacing - 0.5
             if clear <= 2.0:
                 clear = 1e9
                 for s in range(begin, end):
                     x, y, z = rf[ri[17] + s], rf[ri[17] + ns + s], rf[ri[17] + 2 * ns + s]
-                    gx = (T[f, 0] * x + T[f, 1] * y + T[f, 2] * z + T[f, 9]) / spacing
-                    gy = (T[f, 3] * x + T[f, 4] * y + T[f, 5] * z + T[f, 10]) / spacing
-                    gz = (T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]) / spacing
+                    gx, gy, gz = _voxel(T, f, x, y, z, spacing)
                     r = radii[s]
                     need = (np.sqrt(r * r + 0.25 * step * step) + bend) / spacing + 0.5
                     free = _away(gx, gy, gz, possible, corner) - need
@@ -241,9 +240,7 @@ def sweep_field(
             clear = 1e9
             for s in range(begin, end):
                 x, y, z = rf[ri[17] + s], rf[ri[17] + ns + s], rf[ri[17] + 2 * ns + s]
-                gx = (T[f, 0] * x + T[f, 1] * y + T[f, 2] * z + T[f, 9]) / spacing
-                gy = (T[f, 3] * x + T[f, 4] * y + T[f, 5] * z + T[f, 10]) / spacing
-                gz = (T[f, 6] * x + T[f, 7] * y + T[f, 8] * z + T[f, 11]) / spacing
+                gx, gy, gz = _voxel(T, f, x, y, z, spacing)
                 ball = radii[s] / spacing
                 free = _away(gx, gy, gz, possible, corner) - ball - 0.87
                 clear = min(clear, free)

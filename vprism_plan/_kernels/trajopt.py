@@ -5,6 +5,12 @@ Robots are packed as in `vprism_plan._kernels.robot`. Every kernel walks over th
 trajectory, places the spheres, turns the slope of the cost at each sphere's centre into a force,
 and the forces into joint gradients: moments about the joints' axes, summed from the leaves to the
 base. `vprism_plan.trajopt` has the same in plain torch; the tests compare the two.
+
+Samples are configurations q (m, dof), the waypoint before each (`edge`), how far on the edge it
+is (`fraction`), and its share of the time (`weight`).
+
+Fields V (rules, nx, ny, nz) hold signed distances at nodes, E the least of them per block, and wf:
+origin x, y, z, spacing, solid outside, number of planes, margin, room, then the planes.
 """
 
 import math
@@ -19,8 +25,7 @@ _SHORT = 1e-6  # metres; as in vprism_plan.trajopt.cost
 
 @njit(cache=True, nogil=True)
 def _frames(q, rf, ri, T, L):
-    """Fill T (frames, 12) with frame poses, L (links, 3) with the centres of the balls around
-    the links."""
+    """Fill T (frames, 12) with poses, L (links, 3) with the centres of the balls round links."""
     fk_frames(q, rf, ri, T)
     for link in range(ri[2]):
         f = ri[ri[9] + 4 * link]
@@ -29,14 +34,6 @@ def _frames(q, rf, ri, T, L):
             L[link, r] = T[f, 9 + r]
             for c in range(3):
                 L[link, r] += T[f, 3 * r + c] * rf[o + c]
-
-
-@njit(cache=True, nogil=True)
-def _place(q, rf, ri, T, L, C):
-    """Place frames, links and all spheres."""
-    _frames(q, rf, ri, T, L)
-    for link in range(ri[2]):
-        place_link(link, T, rf, ri, C)
 
 
 @njit(cache=True, nogil=True)
@@ -51,53 +48,50 @@ def _add_wrench(W, f, px, py, pz, x, y, z):
 
 
 @njit(cache=True, nogil=True)
-def _wrench_gradient(T, rf, ri, W, tau):
-    """Fill tau (dof,) with the gradient that wrenches W (frames, 6) make; W is used up."""
-    for j in range(ri[4]):
-        tau[j] = 0.0
+def _wrench_gradient(T, rf, ri, W):
+    """Gradient (dof,) that wrenches W (frames, 6) make; W is used up."""
+    tau = np.zeros(ri[4])
     fi = ri[8]
     for f in range(ri[0] - 1, 0, -1):
-        ax = T[f, 2]
-        ay = T[f, 5]
-        az = T[f, 8]
+        ax, ay, az = T[f, 2], T[f, 5], T[f, 8]
         if ri[fi + 3 * f + 1] == 2:
             value = ax * W[f, 0] + ay * W[f, 1] + az * W[f, 2]
         else:
-            px = T[f, 9]
-            py = T[f, 10]
-            pz = T[f, 11]
+            px, py, pz = T[f, 9], T[f, 10], T[f, 11]
             value = ax * (W[f, 3] - py * W[f, 2] + pz * W[f, 1])
             value += ay * (W[f, 4] - pz * W[f, 0] + px * W[f, 2])
             value += az * (W[f, 5] - px * W[f, 1] + py * W[f, 0])
         tau[ri[fi + 3 * f + 2]] += rf[ri[16] + 14 * f + 12] * value
-        p = ri[fi + 3 * f]
         for a in range(6):
-            W[p, a] += W[f, a]
+            W[ri[fi + 3 * f], a] += W[f, a]
+    return tau
 
 
 @njit(cache=True, nogil=True)
-def _joint_gradient(T, C, F, active, rf, ri, W, tau):
-    """Fill tau (dof,) with the gradient that forces F (3, spheres) at the centres make.
-
-    Only links that are active have forces.
-    """
-    W[:] = 0.0
+def _pull(T, C, F, active, rf, ri, weight, e, fraction, grad):
+    """Add to grad (T, dof) what forces F (3, spheres) on active links make of a sample."""
+    W = np.zeros((ri[0], 6))
     for link in range(ri[2]):
-        if not active[link]:
-            continue
-        li = ri[9] + 4 * link
-        for s in range(ri[li + 1], ri[li + 2]):
-            _add_wrench(W, ri[li], C[0, s], C[1, s], C[2, s], F[0, s], F[1, s], F[2, s])
-    _wrench_gradient(T, rf, ri, W, tau)
+        if active[link]:
+            li = ri[9] + 4 * link
+            for s in range(ri[li + 1], ri[li + 2]):
+                _add_wrench(W, ri[li], C[0, s], C[1, s], C[2, s], F[0, s], F[1, s], F[2, s])
+    tau = _wrench_gradient(T, rf, ri, W)
+    for j in range(len(tau)):
+        share = weight * tau[j]
+        grad[e, j] += (1.0 - fraction) * share
+        if fraction > 0.0:
+            grad[e + 1, j] += fraction * share
 
 
 @njit(cache=True, nogil=True)
 def place_all(Q, rf, ri, spheres, T, out):
     """Place frames T (n, frames, 12) and the centres out (n, c, 3) of some spheres."""
-    L = np.empty((ri[2], 3))
     C = np.empty((3, ri[1]))
     for n in range(len(Q)):
-        _place(Q[n], rf, ri, T[n], L, C)
+        fk_frames(Q[n], rf, ri, T[n])
+        for link in range(ri[2]):
+            place_link(link, T[n], rf, ri, C)
         for c in range(len(spheres)):
             for a in range(3):
                 out[n, c, a] = C[a, spheres[c]]
@@ -106,69 +100,15 @@ def place_all(Q, rf, ri, spheres, T, out):
 @njit(cache=True, nogil=True)
 def pull_all(T, centers, frames, forces, rf, ri, grad):
     """Fill grad (n, dof) with what forces (n, c, 3) at centres that move with frames make."""
-    W = np.empty((ri[0], 6))
     for n in range(len(forces)):
-        W[:] = 0.0
+        W = np.zeros((ri[0], 6))
         for c in range(len(frames)):
-            x = forces[n, c, 0]
-            y = forces[n, c, 1]
-            z = forces[n, c, 2]
+            x, y, z = forces[n, c, 0], forces[n, c, 1], forces[n, c, 2]
             if x != 0.0 or y != 0.0 or z != 0.0:
                 _add_wrench(
                     W, frames[c], centers[n, c, 0], centers[n, c, 1], centers[n, c, 2], x, y, z
                 )
-        _wrench_gradient(T[n], rf, ri, W, grad[n])
-
-
-@njit(cache=True, nogil=True)
-def subdivide(Q, delta, rf, ri, turns, spacing, max_turn, most, parts):
-    """Fill parts (T - 1,): into how many each edge of a trajectory is divided."""
-    n = ri[1]
-    T = np.empty((ri[0], 12))
-    C = np.empty((2, 3, n))
-    L = np.empty((ri[2], 3))
-    _place(Q[0], rf, ri, T, L, C[0])
-    for e in range(len(parts)):
-        now = (e + 1) & 1
-        _place(Q[e + 1], rf, ri, T, L, C[now])
-        square = 0.0
-        for s in range(n):
-            x = C[1, 0, s] - C[0, 0, s]
-            y = C[1, 1, s] - C[0, 1, s]
-            z = C[1, 2, s] - C[0, 2, s]
-            square = max(square, x * x + y * y + z * z)
-        turn = 0.0
-        for j in range(Q.shape[1]):
-            if turns[j]:
-                turn = max(turn, abs(delta[e, j]))
-        wanted = max(math.sqrt(square) / spacing, turn / max_turn)
-        parts[e] = max(1, math.ceil(min(wanted, float(most))))
-
-
-@njit(cache=True, nogil=True)
-def _weight(parts, e, k):
-    """Share of the time of the sample that begins part k of edge e (trapezoid rule)."""
-    edges = len(parts)
-    if edges == 0:
-        return 1.0
-    own = 0.0
-    if e < edges:
-        own = 1.0 / (parts[e] * edges)
-    before = own
-    if k == 0:
-        before = 0.0
-        if e > 0:
-            before = 1.0 / (parts[e - 1] * edges)
-    return 0.5 * (own + before)
-
-
-@njit(cache=True, nogil=True)
-def _add(tau, e, fraction, grad):
-    """Share a sample's gradient between the waypoints it lies between."""
-    for j in range(len(tau)):
-        grad[e, j] += (1.0 - fraction) * tau[j]
-        if fraction > 0.0:
-            grad[e + 1, j] += fraction * tau[j]
+        grad[n] = _wrench_gradient(T[n], rf, ri, W)
 
 
 # --- fields ------------------------------------------------------------------------
@@ -186,89 +126,69 @@ def _hinge(gap, margin):
 
 
 @njit(cache=True, nogil=True)
+def _taps(v, n):
+    """The three nodes of a quadratic B-spline along one axis, their weights and slopes."""
+    i = min(int(v + 0.5), n - 1)
+    t = v - i
+    return (
+        (max(i - 1, 0), i, min(i + 1, n - 1)),
+        (0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)),
+        (t - 0.5, -2.0 * t, t + 0.5),
+    )
+
+
+@njit(cache=True, nogil=True)
 def _spline(V, rule, sx, sy, sz, h, slope):
     """Quadratic B-spline of V[rule] at grid point s inside the grid; slope (3,) per metre."""
-    nx = V.shape[1]
-    ny = V.shape[2]
-    nz = V.shape[3]
-    i = min(int(sx + 0.5), nx - 1)
-    j = min(int(sy + 0.5), ny - 1)
-    k = min(int(sz + 0.5), nz - 1)
-    tx = sx - i
-    ty = sy - j
-    tz = sz - k
-    k0 = max(k - 1, 0)
-    k2 = min(k + 1, nz - 1)
-    z0 = 0.5 * (0.5 - tz) * (0.5 - tz)
-    z1 = 0.75 - tz * tz
-    z2 = 0.5 * (0.5 + tz) * (0.5 + tz)
+    i, wx, dx = _taps(sx, V.shape[1])
+    j, wy, dy = _taps(sy, V.shape[2])
+    k, wz, dz = _taps(sz, V.shape[3])
     value = 0.0
-    gx = 0.0
-    gy = 0.0
-    gz = 0.0
+    gx = gy = gz = 0.0
     for a in range(3):
-        if a == 0:
-            wx = 0.5 * (0.5 - tx) * (0.5 - tx)
-            dx = tx - 0.5
-        elif a == 1:
-            wx = 0.75 - tx * tx
-            dx = -2.0 * tx
-        else:
-            wx = 0.5 * (0.5 + tx) * (0.5 + tx)
-            dx = tx + 0.5
-        ia = min(max(i + a - 1, 0), nx - 1)
         for b in range(3):
-            if b == 0:
-                wy = 0.5 * (0.5 - ty) * (0.5 - ty)
-                dy = ty - 0.5
-            elif b == 1:
-                wy = 0.75 - ty * ty
-                dy = -2.0 * ty
-            else:
-                wy = 0.5 * (0.5 + ty) * (0.5 + ty)
-                dy = ty + 0.5
-            jb = min(max(j + b - 1, 0), ny - 1)
-            u = V[rule, ia, jb, k0]
-            v = V[rule, ia, jb, k]
-            w = V[rule, ia, jb, k2]
-            along = z0 * u + z1 * v + z2 * w
-            value += wx * wy * along
-            gx += dx * wy * along
-            gy += wx * dy * along
-            gz += wx * wy * ((tz - 0.5) * u - 2.0 * tz * v + (tz + 0.5) * w)
+            u = V[rule, i[a], j[b], k[0]]
+            v = V[rule, i[a], j[b], k[1]]
+            w = V[rule, i[a], j[b], k[2]]
+            along = wz[0] * u + wz[1] * v + wz[2] * w
+            value += wx[a] * wy[b] * along
+            gx += dx[a] * wy[b] * along
+            gy += wx[a] * dy[b] * along
+            gz += wx[a] * wy[b] * (dz[0] * u + dz[1] * v + dz[2] * w)
     slope[0] = gx / h
     slope[1] = gy / h
     slope[2] = gz / h
     return value
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _on_grid(V, wf, x, y, z):
+    """A point in steps of the grid, and the nearest to it inside."""
+    g = ((x - wf[0]) / wf[3], (y - wf[1]) / wf[3], (z - wf[2]) / wf[3])
+    return g, (
+        min(max(g[0], 0.0), V.shape[1] - 1.0),
+        min(max(g[1], 0.0), V.shape[2] - 1.0),
+        min(max(g[2], 0.0), V.shape[3] - 1.0),
+    )
+
+
 @njit(cache=True, nogil=True)
-def _distance(V, rule, origin, h, solid, x, y, z, slope):
+def _distance(V, rule, wf, x, y, z, slope):
     """Spline of signed distances anywhere, with its slope."""
-    gx = (x - origin[0]) / h
-    gy = (y - origin[1]) / h
-    gz = (z - origin[2]) / h
-    cx = min(max(gx, 0.0), V.shape[1] - 1.0)
-    cy = min(max(gy, 0.0), V.shape[2] - 1.0)
-    cz = min(max(gz, 0.0), V.shape[3] - 1.0)
-    ax = h * (gx - cx)
-    ay = h * (gy - cy)
-    az = h * (gz - cz)
-    away = ax * ax + ay * ay + az * az
-    value = _spline(V, rule, cx, cy, cz, h, slope)
+    h = wf[3]
+    g, c = _on_grid(V, wf, x, y, z)
+    off = (h * (g[0] - c[0]), h * (g[1] - c[1]), h * (g[2] - c[2]))
+    away = off[0] * off[0] + off[1] * off[1] + off[2] * off[2]
+    value = _spline(V, rule, c[0], c[1], c[2], h, slope)
     if away == 0.0:
         return value
-    if gx != cx:
-        slope[0] = 0.0
-    if gy != cy:
-        slope[1] = 0.0
-    if gz != cz:
-        slope[2] = 0.0
-    if solid:
+    for a in range(3):
+        if g[a] != c[a]:
+            slope[a] = 0.0
+    if wf[4] > 0.0:
         far = math.sqrt(away)
-        slope[0] -= ax / far
-        slope[1] -= ay / far
-        slope[2] -= az / far
+        for a in range(3):
+            slope[a] -= off[a] / far
         return value - far
     kept = max(value, 0.0)
     part = 0.5 + 0.5 * min(kept / h, 1.0)
@@ -279,9 +199,8 @@ def _distance(V, rule, origin, h, solid, x, y, z, slope):
         if value < h:
             share += 0.5 * part * away / (h * far)
     outward = part * part / far
-    slope[0] = share * slope[0] + outward * ax
-    slope[1] = share * slope[1] + outward * ay
-    slope[2] = share * slope[2] + outward * az
+    for a in range(3):
+        slope[a] = share * slope[a] + outward * off[a]
     return min(value, 0.0) + far
 
 
@@ -293,27 +212,26 @@ def _may_be_below(V, E, rule, wf, x, y, z, need):
     distances, 1-Lipschitz: the 27 nodes lie within sqrt(3) steps of the middle one. Outside the
     grid the spline at the nearest point of it counts, unless everything there is an obstacle.
     """
-    gx = (x - wf[0]) / wf[3]
-    gy = (y - wf[1]) / wf[3]
-    gz = (z - wf[2]) / wf[3]
-    cx = min(max(gx, 0.0), V.shape[1] - 1.0)
-    cy = min(max(gy, 0.0), V.shape[2] - 1.0)
-    cz = min(max(gz, 0.0), V.shape[3] - 1.0)
-    if wf[4] > 0.0 and (cx != gx or cy != gy or cz != gz):
+    g, c = _on_grid(V, wf, x, y, z)
+    if wf[4] > 0.0 and (c[0] != g[0] or c[1] != g[1] or c[2] != g[2]):
         return True
-    if E[rule, int(cx) >> 2, int(cy) >> 2, int(cz) >> 2] >= need:
+    if E[rule, int(c[0]) >> 2, int(c[1]) >> 2, int(c[2]) >> 2] >= need:
         return False
-    return V[rule, int(cx + 0.5), int(cy + 0.5), int(cz + 0.5)] < need + 1.75 * wf[3]
+    return V[rule, int(c[0] + 0.5), int(c[1] + 0.5), int(c[2] + 0.5)] < need + 1.75 * wf[3]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _over(wf, o, x, y, z):
+    """Height of a point over the plane at o."""
+    return wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3]
 
 
 @njit(cache=True, nogil=True)
-def _obstacle_terms(T, L, C, placed, rf, ri, V, E, wf, radii, grown, slope, value, G, active):
+def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, active):
     """Fill each sphere's potential and its slope at the centre; whether any is not 0.
 
-    wf: origin x, y, z, spacing, solid outside, number of planes, margin, then the planes.
     Links that are not active are wholly beyond the margin.
     """
-    h = wf[3]
     margin = wf[6]
     found = False
     for link in range(ri[2]):
@@ -324,94 +242,63 @@ def _obstacle_terms(T, L, C, placed, rf, ri, V, E, wf, radii, grown, slope, valu
             continue
         # The spline at a sphere's centre lies between nodes at most 2.6 steps from it, a node is
         # within 0.9 of the ball's centre, and `grown` adds at most 0.9 to a radius.
-        ball = rf[ri[18] + 4 * link + 3] + wf[7]
-        x = L[link, 0]
-        y = L[link, 1]
-        z = L[link, 2]
-        near = _may_be_below(V, E, rule, wf, x, y, z, ball + margin + 4.4 * h)
+        need = rf[ri[18] + 4 * link + 3] + wf[7] + margin
+        x, y, z = L[link, 0], L[link, 1], L[link, 2]
+        near = _may_be_below(V, E, rule, wf, x, y, z, need + 4.4 * wf[3])
         for p in range(int(wf[5])):
-            o = 8 + 4 * p
-            away = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3]
-            near = near or away < ball + margin
+            near = near or _over(wf, 8 + 4 * p, x, y, z) < need
         if not near:
             continue
         active[link] = True
-        if not placed:
-            place_link(link, T, rf, ri, C)
+        place_link(link, T, rf, ri, C)
         for s in range(ri[li + 1], ri[li + 2]):
             value[s] = 0.0
-            G[0, s] = 0.0
-            G[1, s] = 0.0
-            G[2, s] = 0.0
-            x = C[0, s]
-            y = C[1, s]
-            z = C[2, s]
-            need = grown[s] + margin
-            if _may_be_below(V, E, rule, wf, x, y, z, need):
-                gap = _distance(V, rule, wf, h, wf[4] > 0.0, x, y, z, slope) - grown[s]
+            for a in range(3):
+                G[a, s] = 0.0
+            x, y, z = C[0, s], C[1, s], C[2, s]
+            if _may_be_below(V, E, rule, wf, x, y, z, grown[s] + margin):
+                gap = _distance(V, rule, wf, x, y, z, slope) - grown[s]
                 if gap < margin:
                     found = True
                     value[s], steep = _hinge(gap, margin)
-                    G[0, s] = steep * slope[0]
-                    G[1, s] = steep * slope[1]
-                    G[2, s] = steep * slope[2]
+                    for a in range(3):
+                        G[a, s] = steep * slope[a]
             for p in range(int(wf[5])):
-                o = 8 + 4 * p
-                gap = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3] - radii[s]
+                gap = _over(wf, 8 + 4 * p, x, y, z) - radii[s]
                 if gap < margin:
                     found = True
                     more, steep = _hinge(gap, margin)
                     value[s] += more
-                    G[0, s] += steep * wf[o]
-                    G[1, s] += steep * wf[o + 1]
-                    G[2, s] += steep * wf[o + 2]
+                    for a in range(3):
+                        G[a, s] += steep * wf[8 + 4 * p + a]
     return found
 
 
 @njit(cache=True, nogil=True)
-def clearance(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
-    """Obstacle cost of one trajectory (T, dof) over time; adds its gradient to grad (T, dof)."""
-    n = ri[1]
+def clearance(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
+    """Obstacle cost of one trajectory over time; adds its gradient to grad (T, dof)."""
     T = np.empty((ri[0], 12))
     L = np.empty((ri[2], 3))
-    C = np.empty((3, n))
-    value = np.zeros(n)
-    G = np.zeros((3, n))
+    C = np.empty((3, ri[1]))
+    value = np.zeros(ri[1])
+    G = np.zeros((3, ri[1]))
     active = np.zeros(ri[2], np.bool_)
-    W = np.empty((ri[0], 6))
-    tau = np.empty(ri[4])
-    q = np.empty(ri[4])
     slope = np.empty(3)
     total = 0.0
-    edges = len(parts)
-    for e in range(edges + 1):
-        count = parts[e] if e < edges else 1
-        for k in range(count):
-            fraction = k / count
-            for j in range(ri[4]):
-                q[j] = Q[e, j]
-                if k > 0:
-                    q[j] += fraction * delta[e, j]
-            _frames(q, rf, ri, T, L)
-            if not _obstacle_terms(
-                T, L, C, False, rf, ri, V, E, wf, radii, grown, slope, value, G, active
-            ):
-                continue
-            w = _weight(parts, e, k)
-            _joint_gradient(T, C, G, active, rf, ri, W, tau)
-            for j in range(ri[4]):
-                tau[j] *= w
-            _add(tau, e, fraction, grad)
+    for i in range(len(q)):
+        _frames(q[i], rf, ri, T, L)
+        if _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, active):
+            _pull(T, C, G, active, rf, ri, weight[i], edge[i], fraction[i], grad)
             for link in range(ri[2]):
                 if active[link]:
                     li = ri[9] + 4 * link
                     for s in range(ri[li + 1], ri[li + 2]):
-                        total += w * value[s]
+                        total += weight[i] * value[s]
     return total
 
 
 @njit(cache=True, nogil=True)
-def clearance_by_length(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
+def clearance_by_length(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
     """The same over the ways of the spheres' centres; sample by sample, the last one kept."""
     n = ri[1]
     T = np.empty((2, ri[0], 12))
@@ -420,43 +307,30 @@ def clearance_by_length(Q, delta, parts, rf, ri, V, E, wf, radii, grown, grad):
     value = np.zeros((2, n))
     G = np.zeros((2, 3, n))
     F = np.zeros((2, 3, n))
-    active = np.zeros((2, ri[2]), np.bool_)
+    active = np.zeros(ri[2], np.bool_)
     everywhere = np.ones(ri[2], np.bool_)
-    W = np.empty((ri[0], 6))
-    tau = np.empty(ri[4])
-    q = np.empty(ri[4])
     slope = np.empty(3)
     total = 0.0
-    edges = len(parts)
-    now = 0
-    edge_before = -1
-    fraction_before = 0.0
-    for e in range(edges + 1):
-        count = parts[e] if e < edges else 1
-        for k in range(count):
-            fraction = k / count
-            for j in range(ri[4]):
-                q[j] = Q[e, j]
-                if k > 0:
-                    q[j] += fraction * delta[e, j]
-            now = 1 - now
-            _place(q, rf, ri, T[now], L, C[now])
+    for i in range(len(q) + 1):
+        now = i & 1
+        old = 1 - now
+        if i < len(q):
+            _frames(q[i], rf, ri, T[now], L)
+            for link in range(ri[2]):
+                place_link(link, T[now], rf, ri, C[now])
             value[now] = 0.0
             G[now] = 0.0
             F[now] = 0.0
             _obstacle_terms(
-                T[now], L, C[now], True, rf, ri, V, E, wf, radii, grown, slope,
-                value[now], G[now], active[now],
+                T[now], L, C[now], rf, ri, V, E, wf, radii, grown, slope,
+                value[now], G[now], active,
             )  # fmt: skip
-            if edge_before >= 0:
+            if i > 0:
                 total += _segment(C, value, G, F, now)
-                old = 1 - now
-                _joint_gradient(T[old], C[old], F[old], everywhere, rf, ri, W, tau)
-                _add(tau, edge_before, fraction_before, grad)
-            edge_before = e
-            fraction_before = fraction
-    _joint_gradient(T[now], C[now], F[now], everywhere, rf, ri, W, tau)
-    _add(tau, edge_before, fraction_before, grad)
+        if i > 0:  # nothing is added to the forces on the sample before any more
+            _pull(
+                T[old], C[old], F[old], everywhere, rf, ri, 1.0, edge[i - 1], fraction[i - 1], grad
+            )
     return total
 
 
@@ -476,13 +350,43 @@ def _segment(C, value, G, F, now):
         way = length - _SHORT
         total += both * way
         pull = both / length
-        F[now, 0, s] += 0.5 * way * G[now, 0, s] + pull * x
-        F[now, 1, s] += 0.5 * way * G[now, 1, s] + pull * y
-        F[now, 2, s] += 0.5 * way * G[now, 2, s] + pull * z
-        F[old, 0, s] += 0.5 * way * G[old, 0, s] - pull * x
-        F[old, 1, s] += 0.5 * way * G[old, 1, s] - pull * y
-        F[old, 2, s] += 0.5 * way * G[old, 2, s] - pull * z
+        for a in range(3):
+            along = pull * (C[now, a, s] - C[old, a, s])
+            F[now, a, s] += 0.5 * way * G[now, a, s] + along
+            F[old, a, s] += 0.5 * way * G[old, a, s] - along
     return total
+
+
+@njit(cache=True, nogil=True)
+def _contacts(centers, rules, V, E, wf, radii, grown, reach):
+    """Contacts with the field and the planes of spheres (n, s, 3) that are nearer than reach.
+
+    Returns (sample, sphere), depth and the depth's slope of each.
+    """
+    most = centers.shape[0] * centers.shape[1] * (1 + int(wf[5]))
+    which = np.empty((most, 2), np.int64)
+    depth = np.empty(most)
+    slopes = np.empty((most, 3))
+    slope = np.empty(3)
+    found = 0
+    for i in range(centers.shape[0]):
+        for s in range(centers.shape[1]):
+            x, y, z = centers[i, s, 0], centers[i, s, 1], centers[i, s, 2]
+            if _may_be_below(V, E, rules[s], wf, x, y, z, grown[s] + reach):
+                which[found] = (i, s)
+                depth[found] = grown[s] - _distance(V, rules[s], wf, x, y, z, slope)
+                for a in range(3):
+                    slopes[found, a] = -slope[a]
+                found += 1
+            for p in range(int(wf[5])):
+                value = _over(wf, 8 + 4 * p, x, y, z)
+                if value < radii[s] + reach:
+                    which[found] = (i, s)
+                    depth[found] = radii[s] - value
+                    for a in range(3):
+                        slopes[found, a] = -wf[8 + 4 * p + a]
+                    found += 1
+    return which[:found], depth[:found], slopes[:found]
 
 
 @njit(cache=True, nogil=True)
@@ -501,28 +405,16 @@ def _soft_contact(x, cut):
 @njit(cache=True, nogil=True)
 def certain_hazards(centers, rules, V, E, wf, radii, grown, soft, cut, value, slopes):
     """Hazard of contact with the field and the planes for spheres (n, s, 3), and its slopes."""
-    slope = np.empty(3)
-    far = cut * soft
-    for n in range(centers.shape[0]):
-        for s in range(centers.shape[1]):
-            x = centers[n, s, 0]
-            y = centers[n, s, 1]
-            z = centers[n, s, 2]
-            value[n, s] = 0.0
-            slopes[n, s] = 0.0
-            if _may_be_below(V, E, rules[s], wf, x, y, z, grown[s] + far):
-                away = _distance(V, rules[s], wf, wf[3], wf[4] > 0.0, x, y, z, slope)
-                value[n, s], steep = _soft_contact((grown[s] - away) / soft, cut)
-                for a in range(3):
-                    slopes[n, s, a] = -steep / soft * slope[a]
-            for p in range(int(wf[5])):
-                o = 8 + 4 * p
-                gap = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3] - radii[s]
-                if gap < far:
-                    more, steep = _soft_contact(-gap / soft, cut)
-                    value[n, s] += more
-                    for a in range(3):
-                        slopes[n, s, a] -= steep / soft * wf[o + a]
+    value[:] = 0.0
+    slopes[:] = 0.0
+    which, depth, steeper = _contacts(centers, rules, V, E, wf, radii, grown, cut * soft)
+    for c in range(len(depth)):
+        n = which[c, 0]
+        s = which[c, 1]
+        more, steep = _soft_contact(depth[c] / soft, cut)
+        value[n, s] += more
+        for a in range(3):
+            slopes[n, s, a] += steep / soft * steeper[c, a]
 
 
 @njit(cache=True, nogil=True)
@@ -534,35 +426,24 @@ def ball_averages(centers, rules, radii, V, grid, nodes, weights, value, slopes)
     """
     h = grid[3]
     slope = np.empty(3)
-    top = np.empty(3)
-    for a in range(3):
-        top[a] = V.shape[a + 1] - 1.0
+    tx, ty, tz = V.shape[1] - 1.0, V.shape[2] - 1.0, V.shape[3] - 1.0
+    value[:] = 0.0
+    slopes[:] = 0.0
     for n in range(centers.shape[0]):
         for s in range(centers.shape[1]):
-            total = 0.0
-            for a in range(3):
-                slopes[n, s, a] = 0.0
             gx = (centers[n, s, 0] - grid[0]) / h
             gy = (centers[n, s, 1] - grid[1]) / h
             gz = (centers[n, s, 2] - grid[2]) / h
             r = radii[s] / h
-            rule = rules[s]
-            if (
-                gx < -r or gy < -r or gz < -r
-                or gx > top[0] + r or gy > top[1] + r or gz > top[2] + r
-            ):  # fmt: skip
-                value[n, s] = 0.0
+            if min(gx, gy, gz) < -r or gx > tx + r or gy > ty + r or gz > tz + r:
                 continue
             for p in range(len(weights)):
-                x = gx + r * nodes[p, 0]
-                y = gy + r * nodes[p, 1]
-                z = gz + r * nodes[p, 2]
-                if x <= 0.0 or y <= 0.0 or z <= 0.0 or x >= top[0] or y >= top[1] or z >= top[2]:
+                x, y, z = gx + r * nodes[p, 0], gy + r * nodes[p, 1], gz + r * nodes[p, 2]
+                if x <= 0.0 or y <= 0.0 or z <= 0.0 or x >= tx or y >= ty or z >= tz:
                     continue
-                total += weights[p] * _spline(V, rule, x, y, z, h, slope)
+                value[n, s] += weights[p] * _spline(V, rules[s], x, y, z, h, slope)
                 for a in range(3):
                     slopes[n, s, a] += weights[p] * slope[a]
-            value[n, s] = total
 
 
 # --- self-collision ----------------------------------------------------------------
@@ -574,8 +455,7 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
 
     Links with a force are marked active; forces of all others are left as they are.
     """
-    n = ri[1]
-    ro = ri[17] + 3 * n
+    ro = ri[17] + 3 * ri[1]
     bo = ri[18]
     total = 0.0
     active[:] = False
@@ -583,9 +463,7 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
         a = ri[ri[10] + 2 * pair]
         b = ri[ri[10] + 2 * pair + 1]
         room = margin + kept - rf[ri[21] + 1 + pair]
-        x = L[a, 0] - L[b, 0]
-        y = L[a, 1] - L[b, 1]
-        z = L[a, 2] - L[b, 2]
+        x, y, z = L[a, 0] - L[b, 0], L[a, 1] - L[b, 1], L[a, 2] - L[b, 2]
         reach = rf[bo + 4 * a + 3] + rf[bo + 4 * b + 3] + room
         if reach <= 0.0 or x * x + y * y + z * z >= reach * reach:
             continue
@@ -593,36 +471,25 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
             if not active[link]:
                 active[link] = True
                 place_link(link, T, rf, ri, C)
-                for s in range(ri[ri[9] + 4 * link + 1], ri[ri[9] + 4 * link + 2]):
-                    F[0, s] = 0.0
-                    F[1, s] = 0.0
-                    F[2, s] = 0.0
+                F[:, ri[ri[9] + 4 * link + 1] : ri[ri[9] + 4 * link + 2]] = 0.0
+        t0 = ri[ri[9] + 4 * b + 1]
+        t1 = ri[ri[9] + 4 * b + 2]
         for s in range(ri[ri[9] + 4 * a + 1], ri[ri[9] + 4 * a + 2]):
-            x = C[0, s] - L[b, 0]
-            y = C[1, s] - L[b, 1]
-            z = C[2, s] - L[b, 2]
+            px, py, pz = C[0, s], C[1, s], C[2, s]
+            x, y, z = px - L[b, 0], py - L[b, 1], pz - L[b, 2]
             reach = rf[ro + s] + rf[bo + 4 * b + 3] + room
             if reach <= 0.0 or x * x + y * y + z * z >= reach * reach:
                 continue
-            px = C[0, s]
-            py = C[1, s]
-            pz = C[2, s]
             own = rf[ro + s] + room
-            t0 = ri[ri[9] + 4 * b + 1]
-            t1 = ri[ri[9] + 4 * b + 2]
             near = 0  # counted first: a loop without branches is vectorised
             for t in range(t0, t1):
-                x = px - C[0, t]
-                y = py - C[1, t]
-                z = pz - C[2, t]
+                x, y, z = px - C[0, t], py - C[1, t], pz - C[2, t]
                 reach = own + rf[ro + t]
                 near += x * x + y * y + z * z < reach * reach
             if near == 0:
                 continue
             for t in range(t0, t1):
-                x = px - C[0, t]
-                y = py - C[1, t]
-                z = pz - C[2, t]
+                x, y, z = px - C[0, t], py - C[1, t], pz - C[2, t]
                 square = x * x + y * y + z * z + _SHORT * _SHORT
                 reach = own + rf[ro + t]
                 if reach <= 0.0 or square >= reach * reach:
@@ -630,210 +497,121 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
                 far = math.sqrt(square)
                 value, steep = _hinge(far - (reach - margin), margin)
                 total += value
-                steep /= far
-                F[0, s] += steep * x
-                F[1, s] += steep * y
-                F[2, s] += steep * z
-                F[0, t] -= steep * x
-                F[1, t] -= steep * y
-                F[2, t] -= steep * z
+                for row in range(3):
+                    force = steep / far * (C[row, s] - C[row, t])
+                    F[row, s] += force
+                    F[row, t] -= force
     return total
 
 
 @njit(cache=True, nogil=True)
-def self_collision(Q, delta, parts, rf, ri, margin, kept, grad):
+def self_collision(q, edge, fraction, weight, rf, ri, margin, kept, grad):
     """Cost of links near each other of one trajectory; adds its gradient to grad (T, dof)."""
-    n = ri[1]
     T = np.empty((ri[0], 12))
-    C = np.empty((3, n))
+    C = np.empty((3, ri[1]))
     L = np.empty((ri[2], 3))
-    F = np.zeros((3, n))
+    F = np.zeros((3, ri[1]))
     active = np.zeros(ri[2], np.bool_)
-    W = np.empty((ri[0], 6))
-    tau = np.empty(ri[4])
-    q = np.empty(ri[4])
     total = 0.0
-    edges = len(parts)
-    for e in range(edges + 1):
-        count = parts[e] if e < edges else 1
-        for k in range(count):
-            fraction = k / count
-            for j in range(ri[4]):
-                q[j] = Q[e, j]
-                if k > 0:
-                    q[j] += fraction * delta[e, j]
-            _frames(q, rf, ri, T, L)
-            value = _pair_terms(T, C, L, active, rf, ri, margin, kept, F)
-            if value > 0.0:
-                w = _weight(parts, e, k)
-                total += w * value
-                _joint_gradient(T, C, F, active, rf, ri, W, tau)
-                for j in range(ri[4]):
-                    tau[j] *= w
-                _add(tau, e, fraction, grad)
+    for i in range(len(q)):
+        _frames(q[i], rf, ri, T, L)
+        value = _pair_terms(T, C, L, active, rf, ri, margin, kept, F)
+        if value > 0.0:
+            total += weight[i] * value
+            _pull(T, C, F, active, rf, ri, weight[i], edge[i], fraction[i], grad)
     return total
 
 
 # --- draws -------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _taps(v, n, index, weight, steep):
-    """The three nodes of a quadratic B-spline along one axis, their weights and slopes."""
-    i = min(int(v + 0.5), n - 1)
-    t = v - i
-    index[0] = max(i - 1, 0)
-    index[1] = i
-    index[2] = min(i + 1, n - 1)
-    weight[0] = 0.5 * (0.5 - t) * (0.5 - t)
-    weight[1] = 0.75 - t * t
-    weight[2] = 0.5 * (0.5 + t) * (0.5 + t)
-    steep[0] = t - 0.5
-    steep[1] = -2.0 * t
-    steep[2] = t + 0.5
-
-
 @njit(cache=True, nogil=True)
-def _draw_distances(V, rule, index, weight, unit, out):
-    """Spline of every draw's signed distance, metres."""
+def _draw_distances(V, rule, x, y, z, unit, out):
+    """Spline of every draw's signed distance, metres; x, y, z: see `_taps`."""
     out[:] = 0.0
     for a in range(3):
         for b in range(3):
-            across = unit * weight[0, a] * weight[1, b]
+            across = unit * x[1][a] * y[1][b]
             for c in range(3):
-                w = across * weight[2, c]
-                row = V[rule, index[0, a], index[1, b], index[2, c]]
+                w = across * z[1][c]
+                row = V[rule, x[0][a], y[0][b], z[0][c]]
                 for s in range(len(out)):
                     out[s] += w * row[s]
 
 
 @njit(cache=True, nogil=True)
-def _draw_slope(V, rule, index, weight, steep, unit, share, slope):
+def _draw_slope(V, rule, x, y, z, unit, share, slope):
     """Slope of the sum over draws of share times distance."""
     slope[:] = 0.0
     for a in range(3):
         for b in range(3):
             for c in range(3):
-                row = V[rule, index[0, a], index[1, b], index[2, c]]
+                row = V[rule, x[0][a], y[0][b], z[0][c]]
                 total = 0.0
                 for s in range(len(share)):
                     total += share[s] * row[s]
                 total *= unit
-                slope[0] += steep[0, a] * weight[1, b] * weight[2, c] * total
-                slope[1] += weight[0, a] * steep[1, b] * weight[2, c] * total
-                slope[2] += weight[0, a] * weight[1, b] * steep[2, c] * total
+                slope[0] += x[2][a] * y[1][b] * z[1][c] * total
+                slope[1] += x[1][a] * y[2][b] * z[1][c] * total
+                slope[2] += x[1][a] * y[1][b] * z[2][c] * total
 
 
 @njit(cache=True, nogil=True)
-def _near_draws(centers, rules, grown, E, grid, top, reach, rows):
-    """Fill rows (n, 2) with (sample, sphere) where any draw may count; how many there are."""
+def _near_draws(centers, rules, D, E, grid, grown, reach):
+    """(sample, sphere) where any draw may count, and where on the grid they are."""
+    most = centers.shape[0] * centers.shape[1]
+    rows = np.empty((most, 2), np.int64)
+    places = np.empty((most, 3))
+    tx, ty, tz = D.shape[1] - 1.0, D.shape[2] - 1.0, D.shape[3] - 1.0
     found = 0
     for i in range(centers.shape[0]):
         for s in range(centers.shape[1]):
             x = (centers[i, s, 0] - grid[0]) / grid[3]
             y = (centers[i, s, 1] - grid[1]) / grid[3]
             z = (centers[i, s, 2] - grid[2]) / grid[3]
-            if x < 0.0 or y < 0.0 or z < 0.0 or x > top[0] or y > top[1] or z > top[2]:
+            if min(x, y, z) < 0.0 or x > tx or y > ty or z > tz:
                 continue
             if E[rules[s], int(x) >> 2, int(y) >> 2, int(z) >> 2] < grown[s] + reach:
-                if len(rows):
-                    rows[found, 0] = i
-                    rows[found, 1] = s
+                rows[found] = (i, s)
+                places[found] = (x, y, z)
                 found += 1
-    return found
+    return rows[:found], places[:found]
 
 
 @njit(cache=True, nogil=True)
-def _near_certain(centers, rules, grown, radii, V, E, wf, reach, which, depth, slopes):
-    """Fill, per contact with what is certain, (sample, sphere), depth and its slope; count."""
-    found = 0
-    kept = len(depth) > 0
-    slope = np.empty(3)
-    for i in range(centers.shape[0]):
-        for s in range(centers.shape[1]):
-            x = centers[i, s, 0]
-            y = centers[i, s, 1]
-            z = centers[i, s, 2]
-            if _may_be_below(V, E, rules[s], wf, x, y, z, grown[s] + reach):
-                if kept:
-                    value = _distance(V, rules[s], wf, wf[3], wf[4] > 0.0, x, y, z, slope)
-                    which[found, 0] = i
-                    which[found, 1] = s
-                    depth[found] = grown[s] - value
-                    for a in range(3):
-                        slopes[found, a] = -slope[a]
-                found += 1
-            for p in range(int(wf[5])):
-                o = 8 + 4 * p
-                value = wf[o] * x + wf[o + 1] * y + wf[o + 2] * z - wf[o + 3]
-                if value < radii[s] + reach:
-                    if kept:
-                        which[found, 0] = i
-                        which[found, 1] = s
-                        depth[found] = radii[s] - value
-                        for a in range(3):
-                            slopes[found, a] = -wf[o + a]
-                    found += 1
-    return found
-
-
-@njit(cache=True, nogil=True)
-def risk(
-    centers, rules, grown, radii, D, DE, grid, unit, V, E, wf, any_certain, tau, cut, force
-):  # fmt: skip
+def risk(centers, rules, grown, radii, D, DE, grid, unit, V, E, wf, tau, cut, force):
     """Minus log of the share of draws that survive one trajectory; fills force (n, s, 3).
 
     centers (n, s, 3): of the spheres at all samples. D (g, x, y, z, S) int16: signed distances
     of every draw in steps of `unit` metres; DE: least of any draw per block, metres; grid:
-    origin, spacing. V, E, wf: what is certain, as for `clearance`; planes use radii.
+    origin, spacing. V, E, wf: what is certain; planes use radii.
     With depth m, a contact adds exp(m / tau) (1 - exp(-(m + cut) / tau))^2 to the odds of every
     draw it concerns, nothing for m <= -cut; a draw survives with probability 1 / (1 + odds).
     """
     S = D.shape[4]
-    top = np.empty(3)
-    for a in range(3):
-        top[a] = D.shape[a + 1] - 1.0
-    none = np.empty((0, 2), np.int64)
-    count = _near_draws(centers, rules, grown, DE, grid, top, cut, none)
-    rows = np.empty((count, 2), np.int64)
-    if count:
-        _near_draws(centers, rules, grown, DE, grid, top, cut, rows)
-    sure = 0
-    if any_certain:
-        sure = _near_certain(
-            centers, rules, grown, radii, V, E, wf, cut, none, np.empty(0), np.empty((0, 3))
-        )
-    which = np.empty((sure, 2), np.int64)
-    hit = np.empty(sure)
-    slopes = np.empty((sure, 3))
-    if sure:
-        _near_certain(centers, rules, grown, radii, V, E, wf, cut, which, hit, slopes)
-
-    index = np.empty((3, 3), np.int64)
-    weight = np.empty((3, 3))
-    steep = np.empty((3, 3))
-    depth = np.empty((count, S))
-    shift = np.zeros(S)
+    rows, places = _near_draws(centers, rules, D, DE, grid, grown, cut)
+    which, hit, slopes = _contacts(centers, rules, V, E, wf, radii, grown, cut)
+    depth = np.empty((len(rows), S))
     highest = 0.0
-    for c in range(sure):
+    for c in range(len(hit)):
         highest = max(highest, hit[c] / tau)
-    shift[:] = highest
-    for n in range(count):
+    shift = np.full(S, highest)
+    for n in range(len(rows)):
         s = rows[n, 1]
-        for a in range(3):
-            v = (centers[rows[n, 0], s, a] - grid[a]) / grid[3]
-            _taps(v, D.shape[a + 1], index[a], weight[a], steep[a])
-        _draw_distances(D, rules[s], index, weight, unit, depth[n])
+        x = _taps(places[n, 0], D.shape[1])
+        y = _taps(places[n, 1], D.shape[2])
+        z = _taps(places[n, 2], D.shape[3])
+        _draw_distances(D, rules[s], x, y, z, unit, depth[n])
         for d in range(S):
             depth[n, d] = grown[s] - depth[n, d]
             shift[d] = max(shift[d], depth[n, d] / tau)
     odds = np.zeros(S)
-    for n in range(count):
+    for n in range(len(rows)):
         for d in range(S):
             m = depth[n, d]
             if m > -cut:
                 odds[d] += math.exp(m / tau - shift[d]) * (1.0 - math.exp(-(m + cut) / tau)) ** 2
-    for c in range(sure):
+    for c in range(len(hit)):
         if hit[c] > -cut:
             soft = (1.0 - math.exp(-(hit[c] + cut) / tau)) ** 2
             for d in range(S):
@@ -855,7 +633,7 @@ def risk(
 
     slope = np.empty(3)
     pull = np.empty(S)
-    for n in range(count):
+    for n in range(len(rows)):
         s = rows[n, 1]
         strong = 0.0
         for d in range(S):
@@ -865,21 +643,19 @@ def risk(
                 fall = 1.0 - math.exp(-2.0 * (m + cut) / tau)
                 pull[d] = share[d] * math.exp(m / tau - shift[d]) * fall
                 strong = max(strong, pull[d])
-        if strong == 0.0:
-            continue
-        for a in range(3):
-            v = (centers[rows[n, 0], s, a] - grid[a]) / grid[3]
-            _taps(v, D.shape[a + 1], index[a], weight[a], steep[a])
-        _draw_slope(D, rules[s], index, weight, steep, unit / grid[3], pull, slope)
-        for a in range(3):
-            force[rows[n, 0], s, a] -= slope[a]
-    for c in range(sure):
-        if hit[c] <= -cut:
-            continue
-        fall = 1.0 - math.exp(-2.0 * (hit[c] + cut) / tau)
-        strong = 0.0
-        for d in range(S):
-            strong += share[d] * math.exp(hit[c] / tau - shift[d])
-        for a in range(3):
-            force[which[c, 0], which[c, 1], a] += fall * strong * slopes[c, a]
+        if strong > 0.0:
+            x = _taps(places[n, 0], D.shape[1])
+            y = _taps(places[n, 1], D.shape[2])
+            z = _taps(places[n, 2], D.shape[3])
+            _draw_slope(D, rules[s], x, y, z, unit / grid[3], pull, slope)
+            for a in range(3):
+                force[rows[n, 0], s, a] -= slope[a]
+    for c in range(len(hit)):
+        if hit[c] > -cut:
+            fall = 1.0 - math.exp(-2.0 * (hit[c] + cut) / tau)
+            strong = 0.0
+            for d in range(S):
+                strong += share[d] * math.exp(hit[c] / tau - shift[d])
+            for a in range(3):
+                force[which[c, 0], which[c, 1], a] += fall * strong * slopes[c, a]
     return lowest - math.log(total / S)

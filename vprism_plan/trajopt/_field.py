@@ -27,8 +27,7 @@ class SplineField:
     The weights are positive, sum to 1, average to the point and have the variance h^2 / 4
     per axis. So linear functions are reproduced, and where the nodes hold distances d_i to a
     set, |x|^2 - d(x)^2 being convex, the value D obeys D(x)^2 <= d(x)^2 + 3 h^2 / 4: it
-    exceeds a distance by at most that (see `grown`). There is no flat cell on the ridge
-    between two equal nodes, as linear interpolation has.
+    exceeds a distance by at most that (see `grown`).
 
     Outside the grid, a metres from its nearest point c: min(D(c), 0) + hypot(s a, max(D(c), 0)),
     which continues distances outwards, with s = 1 where D(c) >= h, falling to 1/2 at 0: where a
@@ -60,7 +59,10 @@ class SplineField:
     ) -> Float[Tensor, "m s"]:
         """Value at points (metres), under the rule of each column; any order differentiable."""
         device, dtype = points.device, points.dtype
-        values = self._on(device, dtype)
+        if (device, dtype) not in self._tensors:
+            flat = torch.from_numpy(self.values.reshape(-1))
+            self._tensors[device, dtype] = flat.to(device=device, dtype=dtype)
+        values = self._tensors[device, dtype]
         sizes = self.values.shape[1:]
         top = torch.tensor(sizes, device=device).to(dtype) - 1.0
         origin = torch.as_tensor(self.origin, dtype=dtype, device=device)
@@ -87,14 +89,8 @@ class SplineField:
 
     @cached_property
     def blocks(self) -> Float32[np.ndarray, "g bx by bz"]:
-        """Lower bound of the value in each block of 4 x 4 x 4 cells."""
-        lowest = self.values
-        for axis, n in enumerate(lowest.shape[1:], start=1):
-            starts = 4 * np.arange((n - 1) // 4 + 1)[:, None]
-            # A point between nodes i and i + 1 hears of i - 1 to i + 2.
-            rows = np.clip(starts + np.arange(-1, 6), 0, n - 1)
-            lowest = np.take(lowest, rows, axis=axis).min(axis=axis + 1)
-        return np.ascontiguousarray(lowest)
+        """Lower bound of the value in each block; see `block_least`."""
+        return block_least(self.values)
 
     def packed(
         self, margin: float, room: float, planes: Float[np.ndarray, "p 4"]
@@ -107,14 +103,20 @@ class SplineField:
         head = [*self.origin, self.spacing, solid, float(len(planes)), margin, room]
         return np.array([*head, *np.asarray(planes, dtype=np.float64).reshape(-1)])
 
-    def _on(self, device: torch.device, dtype: torch.dtype) -> Tensor:
-        if (device, dtype) not in self._tensors:
-            flat = torch.from_numpy(self.values.reshape(-1))
-            self._tensors[device, dtype] = flat.to(device=device, dtype=dtype)
-        return self._tensors[device, dtype]
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_tensors": {}}
+
+
+def block_least(
+    values: Float32[np.ndarray, "g nx ny nz"],
+) -> Float32[np.ndarray, "g bx by bz"]:
+    """Return the least node that a spline in each block of 4 x 4 x 4 cells reads."""
+    for axis, n in enumerate(values.shape[1:], start=1):
+        starts = 4 * np.arange((n - 1) // 4 + 1)[:, None]
+        # A point between nodes i and i + 1 hears of i - 1 to i + 2.
+        rows = np.clip(starts + np.arange(-1, 6), 0, n - 1)
+        values = np.take(values, rows, axis=axis).min(axis=axis + 1)
+    return np.ascontiguousarray(values)
 
 
 def spline_weights(
@@ -142,9 +144,8 @@ def grown(radii: Float[np.ndarray, " s"], spacing: float) -> Float[np.ndarray, "
 def union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> SplineField:
     """Signed distance to fields' obstacles and half-spaces together, one per contact rule.
 
-    Where an object stands on a table, the way out of the object is not down into the
-    table: depth is the distance to what is outside of both. Without this, the pull of the
-    object's underside and the push of the table cancel.
+    Depth is the distance to what is outside of both: where an object stands on a table, the
+    pull of its underside and the push of the table would cancel.
     """
     field = fields[0]
     key = np.asarray(planes, dtype=np.float64).tobytes()
@@ -163,12 +164,15 @@ def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spl
     x, y, z = (n + 2 for n in field.distance.shape)
     # One more node all around: space outside the grid is a way out of what touches its faces.
     grid = Grid(spacing, first, (x, y, z))
-    rim = np.zeros(grid.shape, dtype=np.float32)
-    for axis, n in enumerate(grid.shape):
-        ends = np.zeros(n, dtype=np.float32)
-        ends[[0, -1]] = spacing**2
-        rim += ends.reshape([-1 if a == axis else 1 for a in range(3)])
-    floor = _plane_distances(grid, planes)
+    ends = [np.float32(spacing**2) * np.isin(np.arange(n), [0, n - 1]) for n in grid.shape]
+    rim = ends[0][:, None, None] + ends[1][:, None] + ends[2]
+    floor = np.full(grid.shape, np.inf, dtype=np.float32)
+    for start in range(0, x, 16):
+        part = floor[start : start + 16]
+        nodes = grid.slab(start, start + len(part))
+        for row in planes:
+            away = (nodes @ row[:3] - row[3]).reshape(part.shape)
+            np.minimum(part, away, out=part, casting="same_kind")
     solid = bool(getattr(field, "solid_outside", False))
     merged = []
     for own in fields:
@@ -178,16 +182,3 @@ def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spl
         source = np.zeros(grid.shape, dtype=np.int16)
         merged.append(finish(NodeDistances(nodes, source), grid, (), solid).distance)
     return SplineField(np.stack(merged), grid.origin, spacing, solid)
-
-
-def _plane_distances(
-    grid: Grid, planes: Float[np.ndarray, "p 4"]
-) -> Float32[np.ndarray, "nx ny nz"]:
-    nearest = np.full(grid.shape, np.inf, dtype=np.float32)
-    for start in range(0, grid.shape[0], 16):
-        stop = min(start + 16, grid.shape[0])
-        nodes = grid.slab(start, stop)
-        for row in planes:
-            away = (nodes @ row[:3] - row[3]).reshape(stop - start, *grid.shape[1:])
-            np.minimum(nearest[start:stop], away, out=nearest[start:stop], casting="same_kind")
-    return nearest

@@ -2,7 +2,6 @@
 """Costs of joint values: smoothness, joint limits, and poses of links."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,9 +11,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from vprism_plan.errors import ConfigError, RobotError
+from vprism_plan._arguments import number, rigid_pose
+from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import TorchKinematics
-from vprism_plan.trajopt.cost import TrajectoryCost, at_least, require_dof
+from vprism_plan.trajopt.cost import TrajectoryCost, require_dof
 
 
 class SmoothnessCost(TrajectoryCost):
@@ -25,13 +25,12 @@ class SmoothnessCost(TrajectoryCost):
 
         sum_t |D^n q_t|^2 / h^(2 n - 1),
 
-    the integral of the squared n-th derivative: it does not depend on how many waypoints
-    a trajectory has. rad^2 / s for velocity, rad^2 / s^3 and rad^2 / s^5 for the others;
-    metres instead of radians for sliding joints. A trajectory with too few waypoints for
-    a difference has none of it. O(T dof).
+    the integral of the squared n-th derivative, whatever the number of waypoints: rad^2 / s,
+    rad^2 / s^3 and rad^2 / s^5; metres for sliding joints. A trajectory with too few waypoints
+    for a difference has none of it. O(T dof).
 
     Args:
-        velocity, acceleration, jerk: factors of the terms, at least 0.
+        velocity, acceleration, jerk: factors of the terms.
         robot: with it, trajectories of another number of joints are refused.
         duration: seconds from the first waypoint to the last.
         joint_weights: (dof,) factors on the squared differences; None is 1.
@@ -52,26 +51,22 @@ class SmoothnessCost(TrajectoryCost):
     ) -> None:
         super().__init__(weight, name)
         self.factors = (
-            at_least("velocity", velocity, 0.0),
-            at_least("acceleration", acceleration, 0.0),
-            at_least("jerk", jerk, 0.0),
+            number("velocity", velocity, 0.0),
+            number("acceleration", acceleration, 0.0),
+            number("jerk", jerk, 0.0),
         )
-        self.duration = at_least("duration", duration, 0.0, "seconds", strictly=True)
+        self.duration = number("duration", duration, 0.0, unit="seconds", above=True)
         self.robot = robot
-        self.joint_weights = None if joint_weights is None else tuple(map(float, joint_weights))
-        if self.joint_weights is not None and not all(
-            0.0 <= w < math.inf for w in self.joint_weights
-        ):
-            raise ConfigError(
-                f"joint_weights is {joint_weights!r}; they must be finite and at least 0"
-            )
+        self.joint_weights: tuple[float, ...] | None = None
+        if joint_weights is not None:
+            self.joint_weights = tuple(number("joint_weights", w, 0.0) for w in joint_weights)
 
     def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
         """Return the cost without its weight."""
         if self.robot is not None:
             require_dof(self.robot, q)
         difference = q.diff(dim=-2)
-        factors: Tensor | None = None
+        factors: Any = 1.0
         if self.joint_weights is not None:
             if len(self.joint_weights) != q.shape[-1]:
                 raise RobotError(
@@ -81,12 +76,8 @@ class SmoothnessCost(TrajectoryCost):
         total = 0.0 * q.sum(dim=(-2, -1))
         step = self.duration / max(1, q.shape[-2] - 1)
         for order, factor in enumerate(self.factors, start=1):
-            if difference.shape[-2] == 0:
-                break
-            if factor > 0.0:
-                squares = difference.square()
-                if factors is not None:
-                    squares = squares * factors
+            if factor > 0.0 and difference.shape[-2] > 0:
+                squares = difference.square() * factors
                 total = total + factor / step ** (2 * order - 1) * squares.sum(dim=(-2, -1))
             difference = difference.diff(dim=-2)
         return total
@@ -116,29 +107,19 @@ class JointLimitCost(TrajectoryCost):
     ) -> None:
         super().__init__(weight, name)
         self.robot = robot
-        self.margin = at_least("margin", margin, 0.0, "radians or metres")
+        self.margin = number("margin", margin, 0.0, unit="radians or metres")
 
     def evaluate(self, q: Float[Tensor, "*batch time dof"]) -> Float[Tensor, "*batch"]:
         """Return the cost without its weight."""
         require_dof(self.robot, q)
-        limits = torch.tensor(
-            [
-                (-math.inf, math.inf)
-                if free
-                else (low + min(self.margin, 0.5 * (high - low)),
-                      high - min(self.margin, 0.5 * (high - low)))
-                for low, high, free in zip(
-                    self.robot.lower.tolist(),
-                    self.robot.upper.tolist(),
-                    self.robot.continuous.tolist(),
-                    strict=True,
-                )
-            ],
-            dtype=q.dtype,
-            device=q.device,
-        )  # fmt: skip
-        below = (limits[:, 0] - q).clamp(min=0.0)
-        above = (q - limits[:, 1]).clamp(min=0.0)
+        robot = self.robot
+        margin = np.minimum(self.margin, 0.5 * (robot.upper - robot.lower))
+        limits = (
+            np.where(robot.continuous, -np.inf, robot.lower + margin),
+            np.where(robot.continuous, np.inf, robot.upper - margin),
+        )
+        lower, upper = (torch.as_tensor(ends, dtype=q.dtype, device=q.device) for ends in limits)
+        below, above = (lower - q).clamp(min=0.0), (q - upper).clamp(min=0.0)
         return (below.square() + above.square()).sum(dim=-1).mean(dim=-1)
 
 
@@ -148,8 +129,7 @@ class PoseCost(TrajectoryCost):
         w_p |t(q) - t*|^2 + w_r 2 (1 - cos angle(R(q), R*)),
 
     metres^2 and, for small angles, radians^2: the second term is half the squared Frobenius
-    distance of the rotations, smooth everywhere. Its gradient falls to 0 half a turn away, where
-    all ways back are equally long.
+    distance of the rotations. Its gradient falls to 0 half a turn away.
 
     Args:
         robot: the robot.
@@ -179,20 +159,9 @@ class PoseCost(TrajectoryCost):
     ) -> None:
         super().__init__(weight, name)
         self.robot, self.link, self.at = robot, link, int(at)
-        self.position_weight = at_least("position_weight", position_weight, 0.0)
-        self.rotation_weight = at_least("rotation_weight", rotation_weight, 0.0)
-        self._wanted = np.array(pose, dtype=np.float64)
-        if not (
-            self._wanted.shape == (4, 4)
-            and np.allclose(self._wanted[:3, :3] @ self._wanted[:3, :3].T, np.eye(3), atol=1e-6)
-            and np.linalg.det(self._wanted[:3, :3]) > 0.0
-            and np.allclose(self._wanted[3], [0.0, 0.0, 0.0, 1.0])
-            and np.isfinite(self._wanted).all()
-        ):
-            raise ConfigError(
-                f"pose is {self._wanted.tolist()}; it must be (4, 4): a rotation, metres, and "
-                "a last row of 0, 0, 0, 1"
-            )
+        self.position_weight = number("position_weight", position_weight, 0.0)
+        self.rotation_weight = number("rotation_weight", rotation_weight, 0.0)
+        self._wanted = rigid_pose("pose", pose)
         if link not in robot._links:
             raise RobotError(f"no link {link!r} in {robot.name}; links: {sorted(robot._links)}")
         sits = robot._links[link]

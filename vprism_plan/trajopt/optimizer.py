@@ -4,25 +4,255 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cache
+from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from vprism_plan._arguments import choice, number, whole
+from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
 from vprism_plan.planning.attempts import within_risk
 from vprism_plan.planning.goals import configuration, refuse
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import checked_seed
-from vprism_plan.trajopt._candidates import Candidates, Settings, path_clearance
-from vprism_plan.trajopt._default_cost import Defaults, has_world
-from vprism_plan.trajopt._seeds import make_seeds
-from vprism_plan.trajopt.result import OptimizeReport, OptimizeResult, SeedReport
+from vprism_plan.trajopt._candidates import (
+    MINIMISERS,
+    Candidates,
+    Objective,
+    make_seeds,
+    path_clearance,
+)
+from vprism_plan.trajopt._minimize import REASONS, Limits
+from vprism_plan.trajopt.cost import SumCost, TrajectoryCost
+from vprism_plan.trajopt.joint_costs import JointLimitCost, SmoothnessCost
+from vprism_plan.trajopt.risk_cost import RiskCost
+from vprism_plan.trajopt.sphere_costs import ClearanceCost, SelfCollisionCost
 
-METHODS = ("lbfgs", "adam")
-_FEWEST = 4  # waypoints: two inner ones, and a window of four around an edge
+_MARGIN = 0.02  # metres beyond the checker's margin from which obstacles push
+_APART = 0.005  # the same of links from each other
+_LIMITS = 0.02  # the same of joint limits, radians or metres
+_CLEAR, _OWN, _WITHIN = 300.0, 300.0, 300.0  # weights against squared velocity
+_RISK = 0.1  # the same of a risk that is as large as `max_risk`
+_BEND = 1e-3  # weight of squared acceleration: corners cost, curves hardly do
+_GROWTH = 0.005  # metres by which a repair's margin exceeds that of the one before
+
+OptimizeStatus = Literal[
+    "exact", "invalid_start", "invalid_goal", "verification_failed", "too_risky", "timeout"
+]
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """Costs over the optimisation, one row per batch of evaluations.
+
+    A row holds, for every seed, the values at the best point it had found by then in the
+    same round; seeds that had ended keep theirs. A new round changes what is minimised.
+
+    Attributes:
+        cost: (I, S) what was minimised.
+        terms: name of each term -> (I, S) its share of `cost`.
+        round: (I,) the round each row belongs to, from 0.
+    """
+
+    cost: Float[np.ndarray, "i s"]
+    terms: dict[str, np.ndarray]
+    round: Int[np.ndarray, " i"]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        terms = {name: values.tolist() for name, values in self.terms.items()}
+        return {"cost": self.cost.tolist(), "terms": terms, "round": self.round.tolist()}
+
+
+@dataclass(frozen=True)
+class SeedReport:
+    """What became of one seed.
+
+    Attributes:
+        name: what it began as: "initial 0", "straight", "via 0", "noise 0", ...
+        cost: what was minimised, at its end.
+        length: Euclidean length of its trajectory in joint space.
+        iterations: steps of the optimiser, over all rounds.
+        stopped: why its last round ended: "converged", "iterations", "stalled" (no step
+            along any direction lowers the cost at this precision) or "time".
+        refused: what the verification said when it was last asked about this trajectory;
+            empty if it is the one returned, or if it never was: a cheaper one passed.
+    """
+
+    name: str
+    cost: float
+    length: float
+    iterations: int
+    stopped: str
+    refused: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        return dict(self.__dict__)
+
+
+@dataclass(frozen=True)
+class OptimizeReport:
+    """The numbers behind an `OptimizeResult`.
+
+    Attributes:
+        method: "lbfgs" or "adam".
+        seed: of every random choice.
+        seeds: one report per seed.
+        winner: number of the seed whose trajectory is returned; None without a path, and
+            for an initial path that is returned as it was given.
+        rounds: how many times the trajectories were optimised.
+        evaluations: trajectories whose cost and gradient were computed.
+        optimization_time, verification_time, total_time: seconds spent on that, on checking
+            edges, and on everything.
+        motion_checks: motions that were checked.
+        cost: of the winner, NaN without one.
+        path_length: Euclidean length of the path in joint space, NaN without one.
+        waypoints: number of rows of the path, 0 without one.
+        min_clearance: smallest clearance, metres, NaN without a path: of the whole path if
+            `keep_clearance` asked for it and the checker can say, else at
+            `clearance_samples` samples of it.
+        kept_clearance: the clearance that the path had to keep, metres; None if none.
+        certified, tolerance, shares, risk, risk_levels, risk_time: as in `PlanReport`.
+    """
+
+    method: str
+    seed: int
+    seeds: tuple[SeedReport, ...] = ()
+    winner: int | None = None
+    rounds: int = 0
+    evaluations: int = 0
+    optimization_time: float = 0.0
+    verification_time: float = 0.0
+    total_time: float = 0.0
+    motion_checks: int = 0
+    cost: float = float("nan")
+    path_length: float = float("nan")
+    waypoints: int = 0
+    min_clearance: float = float("nan")
+    clearance_samples: int = 0
+    kept_clearance: float | None = None
+    certified: bool = False
+    tolerance: float = float("nan")
+    shares: dict[str, float] = field(default_factory=dict)
+    risk: Any = None
+    risk_levels: int = 0
+    risk_time: float = 0.0
+
+    @property
+    def winner_name(self) -> str:
+        """What the returned trajectory began as; empty without one."""
+        return "" if self.winner is None else self.seeds[self.winner].name
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values."""
+        values = dict(self.__dict__)
+        values["seeds"] = [seed.to_dict() for seed in self.seeds]
+        values["risk"] = self.risk.to_dict() if hasattr(self.risk, "to_dict") else None
+        values["winner_name"] = self.winner_name
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class OptimizeResult:
+    """The verdict on an optimisation.
+
+    Attributes:
+        path: verified waypoints (T, dof), radians and metres, start first; None unless the
+            status is "exact". The first row is the start and the last the goal, bit for bit
+            (up to whole turns of continuous joints).
+        status: "exact" (every edge of the path was verified by the checker, the bound on
+            risk included), "invalid_start", "invalid_goal", "verification_failed" (no
+            trajectory passed), "too_risky" (one passed edge by edge; as a whole it is above
+            `max_risk`), "timeout" (none had passed when time was up).
+        message: one line for people: what happened and why.
+        report: the numbers.
+        history: costs over the optimisation; None if it never began.
+        begun: (S, T, dof) the trajectories that the seeds began with.
+        ended: (S, T, dof) what became of them. NOT verified, except the winner.
+        best: waypoints that do NOT solve the query: of the seed of least cost, or the
+            least risky ones; None with a path.
+        explanation: the checker's report on an invalid start or goal or on the first edge
+            of `best` that it refused; None otherwise.
+    """
+
+    path: np.ndarray | None
+    status: OptimizeStatus
+    message: str
+    report: OptimizeReport
+    history: History | None = None
+    begun: np.ndarray | None = None
+    ended: np.ndarray | None = None
+    best: np.ndarray | None = None
+    explanation: Any = None
+
+    @property
+    def solved(self) -> bool:
+        """True only if the path reaches the goal and was verified."""
+        return self.status == "exact"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values, the trajectories of all seeds left out."""
+        return {
+            "path": None if self.path is None else self.path.tolist(),
+            "status": self.status,
+            "message": self.message,
+            "report": self.report.to_dict(),
+            "history": None if self.history is None else self.history.to_dict(),
+        }
+
+
+def default_cost(checker: Any, kept: float | None = None) -> TrajectoryCost:
+    """Return the cost that `optimize` minimises if it is given none.
+
+    Squared velocity (which makes paths short and waypoints even) and a little acceleration,
+    plus clearance, self-collision and joint limits, each with a margin beyond what the
+    checker refuses. If the checker bounds risk, the objects of the map enter as `RiskCost`, in
+    the draws that edges are checked with: instead, or beside their level set where the bound is
+    below the world's `level`.
+
+    Args:
+        checker: a `CollisionChecker`; its margins, allowed contacts and bound on risk count.
+        kept: clearance, metres, that is to be kept, if that is more than the margin.
+
+    Raises:
+        PlanningError: the checker is something else.
+    """
+    return _default_costs(checker, kept)(0)
+
+
+def _default_costs(checker: Any, kept: float | None) -> Callable[[int], TrajectoryCost]:
+    """The default cost as level 0; from 1, what repairs add: all but smoothness, from farther."""
+    if not isinstance(checker, CollisionChecker):
+        raise PlanningError(
+            f"there is no default cost for a {type(checker).__name__}; pass `cost`, or use "
+            "a CollisionChecker"
+        )
+    config, robot = checker.config, checker.robot
+    beyond = 0.0 if kept is None else kept - float(config.margin)
+    margin = max(_MARGIN, beyond + 0.5 * _MARGIN)
+
+    @cache
+    def risk(bound: float) -> TrajectoryCost:
+        """What stands for the map's objects where the checker judges them by draws."""
+        return RiskCost(checker, seed=config.risk_seed, weight=_RISK / bound)
+
+    def cost(level: int) -> TrajectoryCost:
+        smooth = SmoothnessCost(velocity=1.0, acceleration=_BEND, robot=robot)
+        return SumCost(
+            *([smooth] if level == 0 else []),
+            ClearanceCost(checker, margin=margin + _GROWTH * level, weight=_CLEAR),
+            *([] if config.max_risk is None else [risk(config.max_risk)]),
+            SelfCollisionCost(checker, margin=_APART, weight=_OWN),
+            JointLimitCost(robot, margin=_LIMITS, weight=_WITHIN),
+        )
+
+    return cost
 
 
 def optimize(
@@ -56,11 +286,9 @@ def optimize(
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
-        start: start configuration (dof,), radians or metres.
-        goal: goal configuration (dof,).
+        start, goal: configurations (dof,), radians or metres.
         cost: what to minimise, a module (..., T, dof) -> (...), differentiable; it is given
-            float64 on the CPU. None: `default_cost(checker)`, which needs a
-            `CollisionChecker`.
+            float64 on the CPU. None: `default_cost(checker)`.
         seeds: how many trajectories. The initial paths come first, then the straight line,
             then detours through random free configurations and smooth noise, in turns.
         waypoints: of each, start and goal included, at least 4.
@@ -73,8 +301,8 @@ def optimize(
         seed: of the random seeds. The same arguments give the same result, unless the time
             limit strikes.
         time_limit: seconds after which nothing more is evaluated; what there is then is
-            still verified. None: no limit. Building the default cost counts (seconds, if
-            risk is bounded): build it once and pass it as `cost` where queries follow.
+            still verified. Building the default cost counts (seconds, if risk is bounded):
+            build it once and pass it as `cost` where queries follow.
         guard: cost of being where the checker refuses, which repairs add. None: the
             default cost's own terms with a margin that grows; nothing is repaired without a
             `CollisionChecker`. Repairs go on from where the trajectories are and start anew
@@ -86,82 +314,45 @@ def optimize(
             default cost.
         clearance_step: distance between the samples of the reported clearance.
 
-    Returns:
-        An `OptimizeResult`; `result.solved` is True only for a verified path.
-
     Raises:
         PlanningError: an argument is malformed, naming the value and the valid ones.
     """
     began = time.perf_counter()
-    limit = _checked_numbers(
-        seeds=seeds,
-        waypoints=waypoints,
-        method=method,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-        time_limit=time_limit,
-        repairs=repairs,
-        clearance_step=clearance_step,
-    )
-    number = checked_seed(seed)
+    choice("method", method, MINIMISERS, error=PlanningError)
+    whole("seeds", seeds, 1, error=PlanningError)
+    whole("waypoints", waypoints, 4, error=PlanningError)  # a window of four around an edge
+    whole("max_iterations", max_iterations, 1, error=PlanningError)
+    whole("repairs", repairs, error=PlanningError)
+    number("tolerance", tolerance, 0.0, 1.0, above=True, below=True, error=PlanningError)
+    number("clearance_step", clearance_step, 0.0, above=True, error=PlanningError)
+    limit = math.inf
+    if time_limit not in (None, math.inf):
+        limit = number("time_limit", time_limit, 0.0, unit="s", above=True, error=PlanningError)
+    seed = checked_seed(seed)
     q_start = configuration(start, checker.robot, "start")
     q_goal = configuration(goal, checker.robot, "goal")
-    report = OptimizeReport(method=method, seed=number)
-    numbers = PlanReport(planner="optimize", seed=number, time_limit=limit)
+    report = OptimizeReport(method=method, seed=seed)
+    numbers = PlanReport(planner="optimize", seed=seed, time_limit=limit)
     for q, what in ((q_start, "start"), (q_goal, "goal")):
         refusal = refuse(checker, q, what, numbers)
         if refusal is not None:
-            return _refused(refusal, replace(report, total_time=time.perf_counter() - began))
-    begun, paths = make_seeds(checker, q_start, q_goal, _paths(initial), seeds, waypoints, number)
-    kept = _kept(checker, keep_clearance, paths, clearance_step)
-    minimised, guards = _costs(checker, cost, guard, kept)
-    settings = Settings(
-        cost=minimised,
-        guard=guards,
-        method=method,
-        iterations=max_iterations,
-        tolerance=tolerance,
-        repairs=repairs,
-        clearance_step=clearance_step,
-        kept=kept,
-    )
-    candidates = Candidates(checker, begun, paths, settings, began + limit)
+            return OptimizeResult(
+                path=None,
+                status=refusal.status,  # type: ignore[arg-type]
+                message=refusal.message,
+                report=replace(report, total_time=time.perf_counter() - began),
+                explanation=refusal.explanation,
+            )
+    begun = make_seeds(checker, q_start, q_goal, _paths(initial), seeds, waypoints, seed)
+    kept = _kept(checker, keep_clearance, begun.given, clearance_step)
+    cost, guards = _costs(checker, cost, guard, kept)
+    limits = Limits(max_iterations, tolerance, began + limit)
+    candidates = Candidates(
+        checker, begun, cost=cost, guard=guards, method=method, limits=limits, repairs=repairs,
+        clearance_step=clearance_step, kept=kept,
+    )  # fmt: skip
     result = within_risk(checker, candidates.attempt, limit)
     return _answer(result, candidates, report, began)
-
-
-def _checked_numbers(
-    *,
-    seeds: int,
-    waypoints: int,
-    method: str,
-    max_iterations: int,
-    tolerance: float,
-    time_limit: float | None,
-    repairs: int,
-    clearance_step: float,
-) -> float:
-    """Refuse arguments that make no sense; return the time limit, infinite for None."""
-    if method not in METHODS:
-        raise PlanningError(f"method is {method!r}; valid values are {', '.join(METHODS)}")
-    for name, value, least in (
-        ("seeds", seeds, 1),
-        ("waypoints", waypoints, _FEWEST),
-        ("max_iterations", max_iterations, 1),
-        ("repairs", repairs, 0),
-    ):
-        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-        if not whole or value < least:
-            raise PlanningError(f"{name} is {value!r}; it must be a whole number from {least}")
-    if not 0.0 < tolerance < 1.0:
-        raise PlanningError(f"tolerance is {tolerance!r}; it must be between 0 and 1")
-    if not clearance_step > 0.0:
-        raise PlanningError(f"clearance_step is {clearance_step!r}; it must be more than 0")
-    if time_limit is None:
-        return math.inf
-    if not time_limit > 0.0:
-        raise PlanningError(f"time_limit is {time_limit!r} s; it must be more than 0, or None")
-    return float(time_limit)
 
 
 def _paths(initial: Any) -> list[Any]:
@@ -180,15 +371,10 @@ def _kept(
     checker: CheckerLike, keep: bool | np.bool_ | float, paths: list[np.ndarray], step: float
 ) -> float | None:
     """Return the clearance to be kept, metres."""
-    if isinstance(keep, bool | np.bool_):
-        if not keep:
-            return None
-    else:
-        if not math.isfinite(keep):
-            raise PlanningError(
-                f"keep_clearance is {keep!r}; it must be True, False or a number of metres"
-            )
-        return float(keep)
+    if not isinstance(keep, bool | np.bool_):
+        return number("keep_clearance", keep, unit="of metres, True or False", error=PlanningError)
+    if not keep:
+        return None
     if not paths:
         raise PlanningError(
             "keep_clearance is True, but there is no initial path whose clearance could be "
@@ -208,21 +394,11 @@ def _costs(
                 "(..., T, dof) -> (...)"
             )
     guards = None if guard is None else lambda _: guard
-    if cost is None or (guard is None and has_world(checker)):
-        defaults = Defaults(checker, kept)
-        cost = defaults.cost() if cost is None else cost
-        guards = defaults.guard if guards is None else guards
+    if cost is None or (guard is None and isinstance(checker, CollisionChecker)):
+        defaults = _default_costs(checker, kept)
+        cost = defaults(0) if cost is None else cost
+        guards = guards or defaults
     return cost, guards
-
-
-def _refused(refusal: PlanResult, report: OptimizeReport) -> OptimizeResult:
-    return OptimizeResult(
-        path=None,
-        status=refusal.status,  # type: ignore[arg-type]
-        message=refusal.message,
-        report=report,
-        explanation=refusal.explanation,
-    )
 
 
 def _answer(
@@ -240,35 +416,23 @@ def _answer(
             cost=float(minimum.value[s]),
             length=float(lengths[s]),
             iterations=int(candidates.iterations[s]),
-            stopped=candidates.stopped(s),
+            stopped=REASONS[int(minimum.reason[s])],
             refused="" if s == winner else candidates.refused[s],
         )
         for s, name in enumerate(candidates.seeds.names)
     )
-    found = result.report
+    of_path = (
+        "path_length", "waypoints", "min_clearance", "clearance_samples", "certified",
+        "tolerance", "shares", "risk", "risk_levels", "risk_time",
+    )  # fmt: skip
+    spent = ("rounds", "optimization_time", "verification_time", "motion_checks")
     report = replace(
-        report,
-        seeds=seeds,
-        winner=winner,
-        rounds=candidates.rounds,
-        evaluations=candidates.objective.evaluations,
-        optimization_time=candidates.optimization_time,
-        verification_time=candidates.verification_time,
-        motion_checks=candidates.motion_checks,
+        report, seeds=seeds, winner=winner, evaluations=candidates.objective.evaluations,
         cost=math.nan if winner is None else seeds[winner].cost,
-        path_length=found.path_length,
-        waypoints=found.waypoints,
-        min_clearance=found.min_clearance,
-        clearance_samples=found.clearance_samples,
-        kept_clearance=candidates.settings.kept,
-        certified=found.certified,
-        tolerance=found.tolerance,
-        shares=found.shares,
-        risk=found.risk,
-        risk_levels=found.risk_levels,
-        risk_time=found.risk_time,
-        total_time=time.perf_counter() - began,
-    )
+        kept_clearance=candidates.kept, total_time=time.perf_counter() - began,
+        **{name: getattr(result.report, name) for name in of_path},
+        **{name: getattr(candidates, name) for name in spent},
+    )  # fmt: skip
     message = result.message
     if winner is not None:
         message = f"from seed {winner} ({seeds[winner].name}) of {len(seeds)}: {message}"
@@ -283,9 +447,21 @@ def _answer(
         status=result.status,  # type: ignore[arg-type]
         message=message,
         report=report,
-        history=candidates.objective.history(),
+        history=_history(candidates.objective, len(seeds)),
         begun=candidates.seeds.q,
         ended=candidates.ended,
         best=result.approximate_path,
         explanation=result.explanation,
+    )
+
+
+def _history(objective: Objective, count: int) -> History:
+    none = np.zeros(count)
+    return History(
+        cost=np.array([best for _, best, _ in objective.rows]).reshape(-1, count),
+        terms={
+            name: np.array([terms.get(name, none) for *_, terms in objective.rows])
+            for name in objective.terms
+        },
+        round=np.array([number for number, *_ in objective.rows], dtype=np.int64),
     )
