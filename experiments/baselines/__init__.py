@@ -29,6 +29,8 @@ METHODS: dict[str, Method] = {
     entry.key: entry
     for entry in (
         _method("vprism", "V-PRISM (ours)"),
+        _method("vprism-flat", "V-PRISM (ours, flat prior)"),
+        _method("network", "Shape prior's network alone", "network"),
         _method("vprism-fine", "V-PRISM (ours, fine)"),
         _method("vprism-paper", "V-PRISM (paper)"),
         _method("bhm-sampling", "V-PRISM (paper) with BHM sampling"),

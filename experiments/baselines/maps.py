@@ -9,6 +9,7 @@ from vprism_plan.perception.observation import Observation
 
 PRESETS: dict[str, Callable[[], MapConfig]] = {
     "vprism": MapConfig,
+    "vprism-flat": MapConfig,
     "vprism-fine": MapConfig.fine,
     "vprism-paper": MapConfig.paper,
     # The data of Bayesian Hilbert maps (Senanayake and Ramos, CoRL 2017): one negative anywhere
@@ -23,5 +24,6 @@ PRESETS: dict[str, Callable[[], MapConfig]] = {
 
 
 def fit(observation: Observation, seed: int, preset: str) -> VPrismMap:
-    """Fit with one of the presets."""
-    return fit_map(observation, PRESETS[preset](), seed)
+    """Fit with one of the presets; "vprism-flat" is the default without its shape prior."""
+    prior = None if preset == "vprism-flat" else "shape"
+    return fit_map(observation, PRESETS[preset](), seed, prior)

@@ -118,10 +118,12 @@ def claims_of(table: str, methods: Sequence[str]) -> tuple[Claim, ...]:
 
 
 def _of_baselines(methods: Sequence[str]) -> list[Claim]:
-    others = [k for k in methods if k in METHODS and not k.startswith("vprism")]
-    continuous = [k for k in others if method(k).continuous]
     claims = []
     for key in ("vprism-paper", "vprism"):
+        others = [k for k in methods if k in METHODS and not k.startswith("vprism")]
+        if key == "vprism-paper" and "network" in others:
+            others.remove("network")  # which the paper does not know
+        continuous = [k for k in others if method(k).continuous]
         name = method(key).label
         # The paper compares with the first two alone.
         for group, keys in (

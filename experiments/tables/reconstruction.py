@@ -32,7 +32,17 @@ TABLES = {
             "Table I of the paper, with more systems: every method sees the same single depth "
             "image and the same object labels. The point estimate and the sigmoid maps learn from "
             "the points and features of our default preset, so that only the method differs.",
-            ("voxel", "octomap", "sgd", "sigmoid", "pointsdf", "vprism-paper", "vprism"),
+            (
+                "voxel",
+                "octomap",
+                "sgd",
+                "sigmoid",
+                "pointsdf",
+                "network",
+                "vprism-paper",
+                "vprism-flat",
+                "vprism",
+            ),  # fmt: skip
             "vprism",
         ),
         Table(

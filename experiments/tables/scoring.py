@@ -19,6 +19,7 @@ from experiments.protocols import Method, Reconstruction, TrueScene
 from experiments.reconstruction import evaluate_reconstruction
 from experiments.scene_truth import SceneTruth
 from experiments.tables.store import Case
+from vprism_plan._resources import data_path
 from vprism_plan.errors import ConfigError
 from vprism_plan.mapping import MapConfig
 from vprism_plan.perception.observation import Observation
@@ -30,10 +31,15 @@ _METHODS: dict[str, int] = {}  # 1 for what is not listed
 # Methods that fit with a preset that may still be tuned: it is part of the question.
 _PRESETS = {
     "vprism": MapConfig, "sgd": MapConfig, "sigmoid": MapConfig, "vprism-fine": MapConfig.fine,
+    "vprism-flat": MapConfig,
 }  # fmt: skip
 
 # Trained, and so may be trained again; found without importing torch.
-_WEIGHTS = Path(baselines.__file__).parent / "pointsdf" / "weights.safetensors"
+_POINTSDF = Path(baselines.__file__).parent / "pointsdf" / "weights.safetensors"
+_SHAPES = data_path("shape_prior.safetensors")
+_WEIGHTS = {
+    "pointsdf": _POINTSDF, "network": _SHAPES, "vprism": _SHAPES, "vprism-fine": _SHAPES,
+}  # fmt: skip
 
 
 def method_question(key: str) -> dict[str, Any]:
@@ -44,8 +50,9 @@ def method_question(key: str) -> dict[str, Any]:
     }  # fmt: skip
     if key in _PRESETS:
         question["config"] = asdict(_PRESETS[key]())
-    if key == "pointsdf" and _WEIGHTS.is_file():  # without them the fit says how to get them
-        question["weights"] = hashlib.sha256(_WEIGHTS.read_bytes()).hexdigest()[:16]
+    weights = _WEIGHTS.get(key)
+    if weights is not None and weights.is_file():  # without them the fit says how to get them
+        question["weights"] = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
     return question
 
 

@@ -36,7 +36,7 @@ from vprism_plan.errors import ConfigError
 from vprism_plan.mapping.training_data import box_centers
 from vprism_plan.perception.observation import Observation
 
-METHODS = ("sgd", "vprism", "vprism-paper")
+METHODS = ("sgd", "network", "vprism", "vprism-flat", "vprism-paper")
 REAL_VARIABLE = "VPRISM_PLAN_REAL"
 _VERSION = 1  # of `compare`; raised by hand when its meaning changes
 _LEAST = 1e-6  # probability that the logarithm of the truth's is cut off at

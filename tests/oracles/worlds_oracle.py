@@ -11,7 +11,10 @@ def draw_logits(map_, points, n_worlds, seed):
     phi = np.exp(-map_.config.gamma * away)
     phi[away > map_.space.radius**2] = 0.0
     features = np.column_stack([phi, np.ones(len(points))])
-    return np.tensordot(features, weights, axes=(1, 1))
+    logits = np.tensordot(features, weights, axes=(1, 1))
+    if map_.prior is not None:
+        logits += map_.prior.at(points, map_.views)[:, None]
+    return logits
 
 
 def owners_of(logits):

@@ -184,8 +184,8 @@ class VPrismMap:
     def sample_weights(self, n: int, seed: int) -> Float[np.ndarray, "n m k"]:
         """Draw n joint samples of all weights: (n, M, K), features in hinge order, bias last.
 
-        The logits of draw s at x are `phi(x) @ result[s]`. The same seed gives the same
-        draws. Classes are independent under the posterior, features are not.
+        The logits of draw s at x are `phi(x) @ result[s]`, and those of `prior`. The same seed
+        gives the same draws. Classes are independent under the posterior, features are not.
         """
         if n < 1:
             raise MapError(f"n is {n}; ask for at least 1 draw")
