@@ -159,3 +159,13 @@ def documented(place, thing):
                 plain = getattr(member, "fget", None) or getattr(member, "__func__", member)
                 if inspect.isfunction(plain) and plain.__doc__ and not name.startswith("_"):
                     yield f"{place}.{name}", plain.__doc__
+
+
+def test_pages_name_source_files_that_are_there(docs, repository):
+    """Of the way things go, and of every stage: a file that moves takes its name along."""
+    everywhere = {path.name for path in (repository / "vprism_plan").rglob("*.py")}
+    for page in [docs / "architecture.md", *sorted((docs / "stages").glob("*.md"))]:
+        for name in re.findall(r"`([a-z_/]+\.py)`", page.read_text()):
+            below = [repository / base / name for base in ("", "vprism_plan", "vprism_plan/world")]
+            found = any(path.exists() for path in below) if "/" in name else name in everywhere
+            assert found, f"{page.name} names {name}"

@@ -42,7 +42,7 @@ TABLES = {
                 "vprism-paper",
                 "vprism-flat",
                 "vprism",
-            ),  # fmt: skip
+            ),
             "vprism",
         ),
         Table(
