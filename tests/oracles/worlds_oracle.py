@@ -13,7 +13,7 @@ def draw_logits(map_, points, n_worlds, seed):
     features = np.column_stack([phi, np.ones(len(points))])
     logits = np.tensordot(features, weights, axes=(1, 1))
     if map_.prior is not None:
-        logits += map_.prior.at(points, map_.views)[:, None]
+        logits += map_.prior.at(points)[:, None]
     return logits
 
 

@@ -22,7 +22,7 @@ from vprism_plan.mapping.em import (
 )
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
 from vprism_plan.mapping.hinges import lattice_hinges, needed_nodes, surface_hinges
-from vprism_plan.mapping.posterior import VPrismMap, feature_variance
+from vprism_plan.mapping.posterior import VPrismMap
 from vprism_plan.mapping.prior import (
     FLAT_OCCUPANCY,
     Prior,
@@ -114,10 +114,9 @@ def _fit(
             _guessing(prior)(views, ids, plane),
             object_crops(views, ids, plane),
             views,
-            lambda points: feature_variance(space, weights, points),
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
         )
-    posterior = _learn(space, problem.data, weights, config, field, views)
+    posterior = _learn(space, problem.data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
         tuple(dict.fromkeys([*known, *problem.warnings])), field,
@@ -247,7 +246,7 @@ def update_map(old: VPrismMap, observation: Observation, prior: Prior | str | No
         data.points, class_of[data.classes], data.lower, data.upper, data.surface,
         data.surface_ids, data.sunk,
     )  # fmt: skip
-    posterior = _learn(space, data, weights, config, old.prior, views)
+    posterior = _learn(space, data, weights, config, old.prior)
     warnings = tuple(dict.fromkeys([*old.warnings, *found]))
     return VPrismMap(
         config, old.object_ids, plane, views, space, posterior, old.seed, warnings, old.prior
@@ -363,7 +362,7 @@ def new_hinges(
 
 def _learn(
     space: FeatureSpace, data: TrainingData, weights: WeightPrior, config: MapConfig,
-    field: PriorField | None, views: Sequence[Observation],
+    field: PriorField | None,
 ) -> Posterior:  # fmt: skip
     features = block_features(space, data.points)
     logger.info(
@@ -376,7 +375,7 @@ def _learn(
         variational_updates=config.variational_updates,
         relaxation=config.relaxation,
         tolerance=config.tolerance,
-        offset=None if field is None else field.at(data.points, views),
+        offset=None if field is None else field.at(data.points),
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior, WeightPrior
+from vprism_plan.mapping.em import Posterior
 from vprism_plan.mapping.factors import correlate, dense_class
 from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
 from vprism_plan.mapping.prior import PriorField
@@ -105,9 +105,9 @@ class VPrismMap:
     @cached_property
     def unsupported_occupancy(self) -> float:
         """P(occupied) where no hinge reaches, so that only the bias weights act."""
-        mean, variance = self._bias_moments()
+        mean, variance = self.posterior.mean[-1].copy(), self.posterior.covariance[-1].copy()
         if self.prior is not None:
-            mean[1:] += self.prior.elsewhere
+            mean[1:] += float(self.prior.elsewhere.max())
         return float(
             prediction.occupied_probability(
                 torch.from_numpy(mean)[None], torch.from_numpy(variance)[None]
@@ -220,16 +220,31 @@ class VPrismMap:
         save_map(self, path)
 
     # ------------------------------------------------------------------ inside
-    def _bias_moments(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        return self.posterior.mean[-1].copy(), self.posterior.covariance[-1].copy()
-
     def _moments(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-        """Return logit mean, variance and kernel mass."""
-        mean, variance, support = point_moments(self.space, self.posterior, points)
+        """Return logit mean, variance and kernel mass; threads over blocks of near points."""
+        n = len(points)
+        mean, variance = np.empty((n, self.n_classes)), np.empty((n, self.n_classes))
+        mean[:], variance[:] = self.posterior.mean[-1], self.posterior.covariance[-1]
+        support = np.zeros(n)
+        lower, upper = self.space.bounds
+        inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
+        if len(inside):
+            order, block_start = make_blocks(points[inside], block_extent(self.space))
+            order = inside[order]
+            space, posterior = self.space, self.posterior
+
+            def chunk(piece: slice) -> None:
+                kernels.point_moments(
+                    points, order, block_start, piece.start, piece.stop, *space.kernel_arguments,
+                    space.gamma, space.radius**2, posterior.mean, posterior.covariance,
+                    space.row_first, space.base, mean, variance, support,
+                )  # fmt: skip
+
+            run_chunked(chunk, len(block_start) - 1, 64)
         if self.prior is not None:
-            mean += self.prior.at(points, self.views)
+            mean += self.prior.at(points)
         return mean, variance, support
 
     def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
@@ -270,7 +285,7 @@ class VPrismMap:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Add the prior's logits to those of the kernels."""
         if self.prior is not None:
-            mean = mean + self.prior.logits(points, self.views)
+            mean = mean + self.prior.logits(points)
         return mean, variance, support
 
     def _dense_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -316,40 +331,3 @@ def _checked_points(points: Any) -> Float[np.ndarray, "n 3"]:
             f"points[{row}] is {array[row].tolist()}; every coordinate must be finite (m)"
         )
     return array
-
-
-def feature_variance(
-    space: FeatureSpace, weights: WeightPrior, points: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, " n"]:
-    """Return the variance of a logit difference at points (m) under independent weights."""
-    covariance = np.zeros_like(weights.precision[:, :2])
-    covariance[space.diagonal] = 1.0 / weights.precision[space.diagonal][:, :2]
-    flat = Posterior(weights.mean[:, :2], covariance, covariance, weights.log_determinant[:2], ())
-    variance = point_moments(space, flat, points)[1]
-    return np.asarray(variance.sum(axis=1))
-
-
-def point_moments(
-    space: FeatureSpace, posterior: Posterior, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
-    """Return mean and variance of phi . w, and the kernel mass; threads over blocks of points."""
-    n, classes = len(points), posterior.mean.shape[1]
-    mean, variance = np.empty((n, classes)), np.empty((n, classes))
-    mean[:], variance[:] = posterior.mean[-1], posterior.covariance[-1]
-    support = np.zeros(n)
-    lower, upper = space.bounds
-    inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
-    if len(inside) == 0:
-        return mean, variance, support
-    order, block_start = make_blocks(points[inside], block_extent(space))
-    order = inside[order]
-
-    def chunk(piece: slice) -> None:
-        kernels.point_moments(
-            points, order, block_start, piece.start, piece.stop, *space.kernel_arguments,
-            space.gamma, space.radius**2, posterior.mean, posterior.covariance,
-            space.row_first, space.base, mean, variance, support,
-        )  # fmt: skip
-
-    run_chunked(chunk, len(block_start) - 1, 64)
-    return mean, variance, support

@@ -8,7 +8,7 @@ was seen overrules the guess, and what was not leaves it.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -32,7 +32,11 @@ _ACROSS = 20.0  # voxels that the seen part of an object spans, at most
 _BEHIND = 3.0  # voxels by which the crop lies behind the middle of what was seen
 _BELOW, _ABOVE = 2.0, 3.0  # voxels under the support surface, and of room above the object
 _SEEN = 0.01  # metres in front of what was seen, where nothing is
-MOST = 8.0  # log-odds: no guess is surer than 0.9997
+_FADE = 3.0  # voxels from the side of a grid to where it alone counts
+_COARSE = 0.025  # metres between the nodes around the grids ...
+_AROUND = 0.1  # ... and how far they reach beyond them
+_MOST_NODES = 200_000
+MOST = 7.0  # log-odds: no guess is surer than 0.999
 FLAT_OCCUPANCY = 0.2  # P(occupied) where nobody guesses
 
 
@@ -185,56 +189,66 @@ class MeshPrior:
 
 @dataclass(frozen=True, eq=False)
 class PriorField:
-    """Prior mean of the objects' logits, that of "empty" being 0.
+    """Prior mean of the objects' logits, that of "empty" being 0; continuous everywhere.
+
+    Around each object its own grid; elsewhere one coarse grid, whose border goes on for ever.
+    Near the sides of a grid the one fades into the other, because a step would look to a level
+    set's bound like a surface.
 
     Attributes:
         T_voxel_world: (C, 3, 4) world (m) to voxels of each object's grid.
         log_odds: (C, n, n, n) float32, at the voxels' centres.
-        elsewhere: log-odds of every object where no grid reaches and no view looked.
+        T_node_world: (3, 4) world (m) to nodes of the coarse grid.
+        elsewhere: (a, b, c) float32, log-odds of every single object at its nodes.
     """
 
     T_voxel_world: Float[np.ndarray, "c 3 4"]
     log_odds: Float[np.ndarray, "c n n n"]
-    elsewhere: float
+    T_node_world: Float[np.ndarray, "3 4"]
+    elsewhere: Float[np.ndarray, "x y z"]
 
-    def logits(
-        self, points: Float[Tensor, "n 3"], views: Sequence[Observation]
-    ) -> Float[Tensor, "n k"]:
-        """Return the prior means of all logits at points (m), differentiable, on their device.
-
-        Where no grid reaches, what the views saw through is empty.
-        """
-        pose = torch.as_tensor(self.T_voxel_world).to(points)
-        grids = torch.as_tensor(self.log_odds).to(points)
+    def logits(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
+        """Return the prior means of all logits at points (m), differentiable, on their device."""
         last = self.log_odds.shape[1] - 1
-        # (C, N, 3), whole numbers are centres; summed term by term, so that a point's bits do
-        # not depend on its company.
-        at = pose[:, None, :, 3]
-        for axis in range(3):
-            at = at + points[:, axis, None] * pose[:, None, :, axis]
-        inside = ((at >= 0.0) & (at <= last)).all(dim=2)
-        columns = [torch.zeros_like(points[:, 0])]
-        somewhere = inside.any(dim=0)
-        outside = torch.full_like(points[:, 0], -MOST)
-        unguessed = (~somewhere).nonzero()[:, 0]
-        if len(unguessed):
-            behind = hidden_depth(points.detach()[unguessed].cpu().numpy(), views)
-            unseen = torch.from_numpy(behind > -_SEEN).to(unguessed.device)
-            outside[unguessed[unseen]] = self.elsewhere
-        for grid, place, own in zip(grids, at, inside, strict=True):
-            rows = own.nonzero()[:, 0]
-            # grid_sample wants the last axis first, scaled to [-1, 1].
-            scaled = (place[rows] * (2.0 / last) - 1.0).flip(1)[None, :, None, None]
-            value = grid_sample(grid[None, None], scaled, align_corners=True)
-            columns.append(outside.index_put((rows,), value.reshape(-1)))
+        places = [_transformed(pose, points) for pose in self.T_voxel_world]
+        # From 0 at the sides of a grid and outside of it to 1 a few voxels inside.
+        shares = [
+            (torch.minimum(at, last - at).amin(dim=1) / _FADE).clamp(0.0, 1.0) for at in places
+        ]
+        covered = torch.stack(shares).amax(dim=0)
+        flat = _sampled(self.elsewhere, _transformed(self.T_node_world, points))
+        other = flat + covered * (-MOST - flat)  # in another object's grid it is not this one
+        columns = [torch.zeros_like(flat)]
+        for grid, at, share in zip(self.log_odds, places, shares, strict=True):
+            rows = (share > 0.0).nonzero()[:, 0]
+            own = _sampled(grid, at[rows])
+            mixed = other[rows] + share[rows] * (own - other[rows])
+            columns.append(other.index_put((rows,), mixed))
         return torch.stack(columns, dim=1)
 
-    def at(
-        self, points: Float[np.ndarray, "n 3"], views: Sequence[Observation]
-    ) -> Float[np.ndarray, "n k"]:
+    def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
         """Return the same for numpy points, float64."""
         with torch.no_grad():
-            return self.logits(torch.from_numpy(np.ascontiguousarray(points)), views).numpy()
+            return self.logits(torch.from_numpy(np.ascontiguousarray(points))).numpy()
+
+
+def _transformed(pose: Float[np.ndarray, "3 4"], points: Float[Tensor, "n 3"]) -> Tensor:
+    """Apply (3, 4) to points term by term, so that a point's bits do not depend on its company."""
+    matrix = torch.as_tensor(pose).to(points)
+    out = matrix[:, 3]
+    for axis in range(3):
+        out = out + points[:, axis, None] * matrix[:, axis]
+    return out
+
+
+def _sampled(grid: Float[np.ndarray, "x y z"], at: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Return the trilinear value of a grid at (n, 3) indices; its border goes on for ever."""
+    # grid_sample wants the last axis first, scaled to [-1, 1].
+    last = torch.tensor(grid.shape).to(at) - 1.0
+    scaled = (at * (2.0 / last) - 1.0).flip(1)[None, :, None, None]
+    values = torch.as_tensor(grid).to(at)[None, None]
+    found = grid_sample(values, scaled, align_corners=True, padding_mode="border")
+    return found.reshape(-1)
 
 
 def with_empty(own: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n k"]:
@@ -242,11 +256,6 @@ def with_empty(own: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n k"]:
     together = own.sum(axis=1)
     own = own * np.minimum(1.0, (1.0 - 1e-6) / np.maximum(together, 1e-12))[:, None]
     return np.column_stack([1.0 - own.sum(axis=1), own])
-
-
-def elsewhere(occupancy: float, objects: int) -> float:
-    """Log-odds of each of some objects that together say P(occupied) = `occupancy`."""
-    return math.log(occupancy / (1.0 - occupancy) / objects)
 
 
 def object_crops(
@@ -286,11 +295,7 @@ def hidden_depth(
 
 
 def prior_field(
-    guess: Guess,
-    crops: Sequence[Crop],
-    views: Sequence[Observation],
-    spread: Callable[[Any], Any],
-    occupancy: float,
+    guess: Guess, crops: Sequence[Crop], views: Sequence[Observation], occupancy: float
 ) -> PriorField:
     """Put a guess onto the objects' grids; where the views saw through, nothing is.
 
@@ -298,25 +303,27 @@ def prior_field(
         guess: the prior's.
         crops: one per object.
         views: that it guessed from.
-        spread: points (n, 3) m -> (n,) prior variance of a difference of two logits there.
-            Log-odds grow with it, so that a map that has seen nothing predicts the guess
-            (section III of the paper shrinks them by as much).
-        occupancy: P(occupied) where no grid reaches.
+        occupancy: P(occupied) where no grid reaches and no view looked.
     """
-    grids = []
-    half = SIDE // 2
+    grids, corners = [], []
+    tiny = math.exp(-MOST)
     for index, crop in enumerate(crops):
         points = crop.centers()
         proba = guess(points)
-        tiny = math.exp(-MOST)
-        proba[hidden_depth(points, views) < -_SEEN, 1:] = 0.0
         odds = np.log(np.maximum(proba[:, index + 1], tiny) / np.maximum(proba[:, 0], tiny))
-        # Variances change over a kernel's length, some voxels: every other one is enough.
-        coarse = points.reshape(SIDE, SIDE, SIDE, 3)[::2, ::2, ::2].reshape(-1, 3)
-        factor = np.sqrt(1.0 + 0.125 * math.pi * spread(coarse)).reshape(half, half, half)
-        for axis in range(3):
-            factor = factor.repeat(2, axis=axis)
-        grid = np.clip(odds, -MOST, MOST).reshape(SIDE, SIDE, SIDE) * factor
-        grids.append(grid.astype(np.float32))
-    poses = np.stack([crop.T_voxel_world() for crop in crops])
-    return PriorField(poses, np.stack(grids), elsewhere(occupancy, len(crops)))
+        odds[hidden_depth(points, views) < -_SEEN] = -MOST
+        grids.append(np.clip(odds, -MOST, MOST).reshape(SIDE, SIDE, SIDE).astype(np.float32))
+        corners += [points.min(axis=0), points.max(axis=0)]
+    lower, upper = np.min(corners, axis=0) - _AROUND, np.max(corners, axis=0) + _AROUND
+    step = max(_COARSE, float(np.prod(upper - lower) / _MOST_NODES) ** (1.0 / 3.0))
+    shape = np.ceil((upper - lower) / step).astype(np.int64) + 1
+    nodes = lower + step * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
+    # Of each object, so that all together say `occupancy`.
+    unknown = math.log(occupancy / (1.0 - occupancy) / len(crops))
+    flat = np.where(hidden_depth(nodes, views) < -_SEEN, -MOST, unknown)
+    return PriorField(
+        np.stack([crop.T_voxel_world() for crop in crops]),
+        np.stack(grids),
+        np.column_stack([np.eye(3), -lower]) / step,
+        flat.reshape(shape).astype(np.float32),
+    )

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,7 @@ _HEADER = "vprism_plan"
 _DIGEST = "sha256"
 _NEEDED_PARTS = ("depth", "labels", "intrinsics")
 _VIEW_PARTS = (*_NEEDED_PARTS, "T_world_camera", "color", "robot_spheres")
+_PRIOR = tuple(field.name for field in fields(PriorField))
 _FARTHEST = 1e6  # metres; kernels count cells up to the farthest hinge
 
 
@@ -56,7 +57,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
     }
     prior = fitted.prior
     if prior is not None:
-        tensors |= {"prior.T_voxel_world": prior.T_voxel_world, "prior.log_odds": prior.log_odds}
+        tensors |= {f"prior.{name}": array for name, array in vars(prior).items()}
     for index, view in enumerate(fitted.views):
         for part in _VIEW_PARTS:
             if getattr(view, part) is not None:
@@ -72,7 +73,6 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "max_range": [view.max_range for view in fitted.views],
         "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
-        "prior_elsewhere": None if prior is None else float(prior.elsewhere).hex(),
     }
     arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     if not path.parent.is_dir():
@@ -162,31 +162,29 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
     if not all(isinstance(text, str) for text in warnings):
         raise MapError("warnings must be sentences")
-    prior = _prior(tensors, meta["prior_elsewhere"], len(object_ids))
+    prior = _prior(tensors, len(object_ids))
     return VPrismMap(
         config, object_ids, plane, views, space, posterior, meta["seed"], warnings, prior
     )
 
 
-def _prior(
-    tensors: Mapping[str, np.ndarray], elsewhere: str | None, objects: int
-) -> PriorField | None:
+def _prior(tensors: Mapping[str, np.ndarray], objects: int) -> PriorField | None:
     """Return the prior's field, if the file has one."""
-    if elsewhere is None:
+    if "prior.log_odds" not in tensors:
         return None
-    field = PriorField(
-        tensors["prior.T_voxel_world"], tensors["prior.log_odds"], float.fromhex(elsewhere)
-    )
-    expected = {
+    field = PriorField(**{name: tensors[f"prior.{name}"] for name in _PRIOR})
+    expected: dict[str, Any] = {
         "T_voxel_world": ((objects, 3, 4), np.float64),
         "log_odds": ((objects, SIDE, SIDE, SIDE), np.float32),
+        "T_node_world": ((3, 4), np.float64),
+        "elsewhere": (field.elsewhere.shape, np.float32),
     }
     for name, (shape, dtype) in expected.items():
         array = getattr(field, name)
         if array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
             raise MapError(f"prior.{name} must be finite {np.dtype(dtype)} {shape}")
-    if not math.isfinite(field.elsewhere):
-        raise MapError(f"prior_elsewhere is {field.elsewhere}")
+    if field.elsewhere.ndim != 3 or min(field.elsewhere.shape) < 2:
+        raise MapError(f"prior.elsewhere has shape {field.elsewhere.shape}")
     return field
 
 
@@ -245,17 +243,8 @@ def _views(tensors: Mapping[str, np.ndarray], count: Any, ranges: Any) -> tuple[
         raise MapError(f"views is {count!r}; a map is learned from one at least")
     if not (isinstance(ranges, list) and len(ranges) == count):
         raise MapError(f"max_range is {ranges!r}; it must be a list of one length per view")
-    names = {
-        "prior.T_voxel_world",
-        "prior.log_odds",
-        "hinges",
-        "mean",
-        "covariance",
-        "precision",
-        "log_determinant",
-        "history",
-        "plane",
-    }
+    names = {"hinges", "mean", "covariance", "precision", "log_determinant", "history", "plane"}
+    names |= {f"prior.{name}" for name in _PRIOR}
     for index in range(count):
         names.update(f"view{index}.{part}" for part in (*_VIEW_PARTS, "plane"))
     stray = sorted(set(tensors) - names)

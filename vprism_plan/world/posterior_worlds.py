@@ -516,5 +516,5 @@ class Owners:
         phi = np.where(away <= space.radius**2, np.exp(-space.gamma * away), 0.0)
         logits = phi @ weights[near] + weights[-1]
         if self._map.prior is not None:
-            logits += np.tile(self._map.prior.at(points, self._map.views), self._n_worlds)
+            logits += np.tile(self._map.prior.at(points), self._n_worlds)
         kernels.classify(logits, self._n_worlds, weights.shape[1] // self._n_worlds, out)
