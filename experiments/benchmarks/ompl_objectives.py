@@ -28,15 +28,8 @@ from vprism_plan._files import replacing, write_text
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.collision.motion import sphere_jacobians
 from vprism_plan.mapping.serialization import load_map
-from vprism_plan.planning import (
-    PathCost,
-    RiskObjective,
-    VPrismRiskObjective,
-    plan,
-    quiet_ompl,
-    state_space,
-    to_state,
-)
+from vprism_plan.planning import VPrismRiskObjective, plan, quiet_ompl, state_space, to_state
+from vprism_plan.planning.objectives import PathCost, RiskObjective
 
 KEPT = Path("build/objectives")
 FIRST_SCENE = 100

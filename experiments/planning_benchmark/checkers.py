@@ -30,9 +30,10 @@ from vprism_plan.errors import ConfigError
 from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception.camera import depth_sigma
 from vprism_plan.robots import Robot
-from vprism_plan.world import Grid, World, WorldConfig
+from vprism_plan.world import World, WorldConfig
 from vprism_plan.world.config import OccludedPolicy
 from vprism_plan.world.distance import Lattice
+from vprism_plan.world.grid import Grid
 from vprism_plan.world.visibility import background_points
 
 _OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things

@@ -16,9 +16,15 @@ from jaxtyping import Float, UInt8
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.robots import Robot
-from vprism_plan.world import DistanceField, Grid, WorldConfig
-from vprism_plan.world.distance import Lattice, NodeDistances, distance_to_lattice, finish
-from vprism_plan.world.grid import choose_grid
+from vprism_plan.world import WorldConfig
+from vprism_plan.world.distance import (
+    DistanceField,
+    Lattice,
+    NodeDistances,
+    distance_to_lattice,
+    finish,
+)
+from vprism_plan.world.grid import Grid, choose_grid
 from vprism_plan.world.visibility import OUTSIDE, View, classify_points, make_view
 
 _AROUND = 0.6  # metres around the seen objects, as a `World` chooses

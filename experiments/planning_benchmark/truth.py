@@ -21,8 +21,8 @@ from vprism_plan.collision.motion import Edges, edges_of, place_points
 from vprism_plan.perception import Plane
 from vprism_plan.robots import Robot
 from vprism_plan.robots.kinematics import frame_poses
-from vprism_plan.world import DistanceField, Grid
-from vprism_plan.world.distance import round_down
+from vprism_plan.world.distance import DistanceField, round_down
+from vprism_plan.world.grid import Grid
 
 TOLERANCE = 0.001  # metres of motion between a point of a path and the nearest sample
 _COARSE = 4  # nodes of the fine grid per node of the coarse one

@@ -16,7 +16,7 @@ import vprism_plan as vp
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.errors import ConfigError, MissingDependencyError, RobotError
 from vprism_plan.perception import Plane
-from vprism_plan.robots import PrimitiveGeometry
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.world.config import Box, Cylinder, HalfSpace, KnownMesh, Sphere
 
 REACH = 0.1  # metres: gaps beyond it are not measured

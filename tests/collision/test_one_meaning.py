@@ -16,7 +16,8 @@ from oracles.small_scenes import at, small_map
 
 import vprism_plan as vp
 from vprism_plan.collision.margins import margin_profile
-from vprism_plan.planning import RiskObjective, VPrismMotionValidator, state_space
+from vprism_plan.planning import VPrismMotionValidator, state_space
+from vprism_plan.planning.objectives import RiskObjective
 from vprism_plan.planning.ompl_adapter import last_valid, to_state
 from vprism_plan.planning.path import verified
 from vprism_plan.planning.result import PlanReport

@@ -23,7 +23,9 @@ def make_checker(places, ball_robot):
     solids = tuple(sphere(0.04, at(0.0, y, 0.04)) for y in places)
     camera = Camera.orbit(np.array([0.0, 0.0, 0.03]), 1.0, np.pi, np.deg2rad(35.0))
     scene = Scene(solids, tuple(range(1, len(places) + 1)), camera)
-    world = vp.World(vp.fit_map(scene.observation, seed=0), vp.WorldConfig(occluded="free"))
+    world = vp.World(
+        vp.fit_map(scene.observation, seed=0, prior=None), vp.WorldConfig(occluded="free")
+    )
     return CollisionChecker(world, ball_robot(0.02), CheckerConfig(n_worlds=1024))
 
 

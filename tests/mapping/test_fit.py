@@ -68,9 +68,9 @@ def test_visible_free_space_is_free(scene, default_map):
 
 
 def test_same_seed_same_bits(scene, small_map, coarse, query):
-    again = fit_map(scene.observation, coarse, seed=1)
+    again = fit_map(scene.observation, coarse, seed=1, prior=None)
     np.testing.assert_array_equal(again.predict_proba(query), small_map.predict_proba(query))
-    other = fit_map(scene.observation, coarse, seed=2)
+    other = fit_map(scene.observation, coarse, seed=2, prior=None)
     assert (other.predict_proba(query) != small_map.predict_proba(query)).any()
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vprism_plan.robots import KinematicArrays
+from vprism_plan.robots.kinematics import KinematicArrays
 
 
 def frame_poses(arrays: KinematicArrays, q: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vprism_plan.robots import KinematicArrays
+from vprism_plan.robots.kinematics import KinematicArrays
 
 
 def random_arrays(rng: np.random.Generator, dof: int = 4, reach: float = 0.6) -> KinematicArrays:

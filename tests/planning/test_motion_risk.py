@@ -13,7 +13,6 @@ from vprism_plan.errors import PlanningError
 from vprism_plan.planning import (
     PoseGoalConfig,
     ReachRegion,
-    RiskObjective,
     VPrismRiskObjective,
     plan,
     quiet_ompl,
@@ -21,7 +20,7 @@ from vprism_plan.planning import (
     to_state,
 )
 from vprism_plan.planning.goals import solve_region
-from vprism_plan.planning.objectives import MotionRisk
+from vprism_plan.planning.objectives import MotionRisk, RiskObjective
 from vprism_plan.robots import Robot
 
 

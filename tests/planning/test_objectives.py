@@ -13,8 +13,6 @@ from ompl import geometric as og
 
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import (
-    PathCost,
-    RiskObjective,
     VPrismMinimaxRiskObjective,
     VPrismRiskObjective,
     VPrismStateValidityChecker,
@@ -24,6 +22,7 @@ from vprism_plan.planning import (
     to_state,
 )
 from vprism_plan.planning.attempts import not_found
+from vprism_plan.planning.objectives import PathCost, RiskObjective
 from vprism_plan.planning.path import cheapen, shorten
 from vprism_plan.planning.search import CLOCKS
 

@@ -15,7 +15,6 @@ from ompl import geometric as og
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import (
     CheckerLike,
-    RobotLike,
     VPrismMotionValidator,
     VPrismStateValidityChecker,
     last_valid,
@@ -26,6 +25,7 @@ from vprism_plan.planning import (
     to_state,
 )
 from vprism_plan.planning.ompl_adapter import nearest_turns
+from vprism_plan.planning.protocols import RobotLike
 
 
 def attach(checker, space=None):

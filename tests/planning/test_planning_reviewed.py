@@ -7,7 +7,8 @@ import pytest
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning import RiskObjective, attempts, plan, state_space
+from vprism_plan.planning import attempts, plan, state_space
+from vprism_plan.planning.objectives import RiskObjective
 from vprism_plan.planning.path import MotionCheck, verified
 from vprism_plan.planning.planners import GuidedGoal
 from vprism_plan.planning.result import PlanReport

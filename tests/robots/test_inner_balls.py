@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from oracles.kinematics_oracle import random_pose
 from scipy.spatial import cKDTree
 
-from vprism_plan.robots import PrimitiveGeometry, Robot
+from vprism_plan.robots import Robot
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.surfaces import inner_balls
 
 SHORT = 0.0075  # metres by which the balls may fall short of the solids

@@ -17,8 +17,9 @@ from vprism_plan._kernels import checking
 from vprism_plan.collision import CollisionChecker, MeshChecker
 from vprism_plan.collision.packing import pack_robot
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
+from vprism_plan.robots import Robot, enclosing_spheres
 from vprism_plan.robots.changes import grown
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.pairs import pairs_touching
 from vprism_plan.world import Sphere, World, WorldConfig
 

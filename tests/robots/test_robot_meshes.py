@@ -7,9 +7,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import Robot, SphereFit
+from vprism_plan.robots import Robot
 from vprism_plan.robots.geometry import find_mesh
 from vprism_plan.robots.report import enclosed, sphere_gap
+from vprism_plan.robots.sphere_fit import SphereFit
 
 URDF = """<robot name="meshed"><link name="base"/><link name="tip"><collision>
   <origin xyz="0.1 0 0.2" rpy="0.3 -0.4 1.1"/>

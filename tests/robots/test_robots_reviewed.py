@@ -8,9 +8,10 @@ from small_urdfs import LIMIT, LINK, TWO, chain, joint
 
 from vprism_plan.cli import main
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import Robot, SphereFit, read_spheres
+from vprism_plan.robots import Robot, read_spheres
 from vprism_plan.robots.geometry import find_mesh
 from vprism_plan.robots.sphere_files import _loader
+from vprism_plan.robots.sphere_fit import SphereFit
 
 BIG = [{"center": [0, 0, 0], "radius": 0.06}]
 SMALL = [{"center": [0, 0, 0], "radius": 0.03}]

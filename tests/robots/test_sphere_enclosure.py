@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from oracles.kinematics_oracle import random_pose, transform
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import PrimitiveGeometry, Robot, enclosing_spheres
+from vprism_plan.robots import Robot, enclosing_spheres
+from vprism_plan.robots.geometry import PrimitiveGeometry
 
 sizes = st.floats(0.002, 0.8)
 

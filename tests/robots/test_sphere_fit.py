@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 from oracles.kinematics_oracle import random_pose
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import PrimitiveGeometry, SphereFit, fit_spheres
+from vprism_plan.robots import fit_spheres
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.report import enclosed, protrusion, sphere_gap
+from vprism_plan.robots.sphere_fit import SphereFit
 
 
 def plate_with_hole():

@@ -23,8 +23,7 @@ from vprism_plan.collision.packing import (
 )
 from vprism_plan.collision.reports import StateReport
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import KinematicArrays
-from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, frame_poses
 from vprism_plan.world.grid import Points, Values
 
 _BATCH = 64  # configurations asked at once where clearance is too small to step by

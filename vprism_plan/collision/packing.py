@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 from vprism_plan._arguments import number
 from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import KinematicArrays
-from vprism_plan.robots.kinematics import KIND_PRISMATIC, joint_values
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, joint_values
 from vprism_plan.world.grid import Vector
 
 # Arrays of joint values: of one configuration, of many, of a path.

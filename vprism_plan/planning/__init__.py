@@ -3,8 +3,6 @@
 
 from vprism_plan.planning.goals import PoseGoalConfig as PoseGoalConfig
 from vprism_plan.planning.goals import ReachRegion as ReachRegion
-from vprism_plan.planning.objectives import PathCost as PathCost
-from vprism_plan.planning.objectives import RiskObjective as RiskObjective
 from vprism_plan.planning.objectives import VPrismMinimaxRiskObjective as VPrismMinimaxRiskObjective
 from vprism_plan.planning.objectives import VPrismRiskObjective as VPrismRiskObjective
 from vprism_plan.planning.ompl_adapter import VPrismMotionValidator as VPrismMotionValidator
@@ -16,12 +14,9 @@ from vprism_plan.planning.ompl_adapter import state_space as state_space
 from vprism_plan.planning.ompl_adapter import to_array as to_array
 from vprism_plan.planning.ompl_adapter import to_state as to_state
 from vprism_plan.planning.plan import plan as plan
-from vprism_plan.planning.planners import PlannerKind as PlannerKind
 from vprism_plan.planning.planners import planners as planners
 from vprism_plan.planning.protocols import CheckerLike as CheckerLike
-from vprism_plan.planning.protocols import RobotLike as RobotLike
 from vprism_plan.planning.protocols import SecondOpinion as SecondOpinion
-from vprism_plan.planning.result import Improvement as Improvement
 from vprism_plan.planning.result import PlanReport as PlanReport
 from vprism_plan.planning.result import PlanResult as PlanResult
 from vprism_plan.planning.result import RefusedGoal as RefusedGoal

@@ -1,21 +1,15 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Robots: URDF in, collision spheres in world coordinates out."""
 
-from vprism_plan.robots.geometry import MeshFile, PrimitiveGeometry
-from vprism_plan.robots.kinematics import KinematicArrays
 from vprism_plan.robots.report import LinkReport, RobotReport
 from vprism_plan.robots.robot import Robot
 from vprism_plan.robots.sphere_files import read_spheres, write_spheres
-from vprism_plan.robots.sphere_fit import SphereFit, enclosing_spheres, fit_spheres
+from vprism_plan.robots.sphere_fit import enclosing_spheres, fit_spheres
 
 __all__ = [
-    "KinematicArrays",
     "LinkReport",
-    "MeshFile",
-    "PrimitiveGeometry",
     "Robot",
     "RobotReport",
-    "SphereFit",
     "enclosing_spheres",
     "fit_spheres",
     "read_spheres",

@@ -6,7 +6,6 @@ from vprism_plan.trajopt.cost import TrajectoryCost as TrajectoryCost
 from vprism_plan.trajopt.joint_costs import JointLimitCost as JointLimitCost
 from vprism_plan.trajopt.joint_costs import PoseCost as PoseCost
 from vprism_plan.trajopt.joint_costs import SmoothnessCost as SmoothnessCost
-from vprism_plan.trajopt.optimizer import History as History
 from vprism_plan.trajopt.optimizer import OptimizeReport as OptimizeReport
 from vprism_plan.trajopt.optimizer import OptimizeResult as OptimizeResult
 from vprism_plan.trajopt.optimizer import SeedReport as SeedReport

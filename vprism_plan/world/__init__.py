@@ -2,8 +2,6 @@
 """A map in, obstacles out: fields that answer in microseconds, and meshes."""
 
 from vprism_plan.world.config import Box, Cylinder, HalfSpace, KnownMesh, Sphere, WorldConfig
-from vprism_plan.world.distance import DistanceField
-from vprism_plan.world.grid import Grid
 from vprism_plan.world.meshes import extract_meshes, extract_union_mesh
 from vprism_plan.world.posterior_worlds import PosteriorWorlds
 from vprism_plan.world.world import World
@@ -11,8 +9,6 @@ from vprism_plan.world.world import World
 __all__ = [
     "Box",
     "Cylinder",
-    "DistanceField",
-    "Grid",
     "HalfSpace",
     "KnownMesh",
     "PosteriorWorlds",

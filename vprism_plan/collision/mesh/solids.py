@@ -14,7 +14,8 @@ from vprism_plan._arguments import choice
 from vprism_plan.collision.mesh.fcl import Shape, point_distance, point_within
 from vprism_plan.collision.packing import Configuration, reach_table
 from vprism_plan.errors import ConfigError, RobotError
-from vprism_plan.robots import PrimitiveGeometry, Robot
+from vprism_plan.robots import Robot
+from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.kinematics import KIND_REVOLUTE
 from vprism_plan.world.config import Box, Cylinder, KnownMesh, Sphere
 from vprism_plan.world.grid import Points, Values, Vector
