@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 from torch import Tensor
@@ -31,7 +32,8 @@ _FINEST = 0.0075  # metres of a voxel, at least
 _ACROSS = 20.0  # voxels that the seen part of an object spans, at most
 _BEHIND = 3.0  # voxels by which the crop lies behind the middle of what was seen
 _BELOW, _ABOVE = 2.0, 3.0  # voxels under the support surface, and of room above the object
-_SEEN = 0.01  # metres in front of what was seen, where nothing is
+_SEEN = 0.015  # metres in front of what was seen ...
+_WINDOW = 3  # ... by all pixels around: nothing is there
 _FADE = 3.0  # voxels from the side of a grid to where it alone counts
 _COARSE = 0.025  # metres between the nodes around the grids ...
 _AROUND = 0.1  # ... and how far they reach beyond them
@@ -272,12 +274,13 @@ def object_crops(
 
 
 def hidden_depth(
-    points: Float[np.ndarray, "n 3"], views: Sequence[Observation]
+    points: Float[np.ndarray, "n 3"], views: Sequence[Observation], window: int = 1
 ) -> Float[np.ndarray, " n"]:
     """Return how far (m) points lie behind what the views saw, negative in front of it.
 
     Of several views the one that sees farthest counts. What no view shows, or only pixels
-    without a return, is infinitely far behind.
+    without a return, is infinitely far behind. With a `window` (pixels) the nearest thing around
+    a point's pixel counts, and a pixel without a return there is as good as none.
     """
     behind = np.full(len(points), np.inf)
     for view in views:
@@ -287,8 +290,9 @@ def hidden_depth(
         with np.errstate(invalid="ignore"):
             column, row = np.rint(pixels).T
             inside = (z > 0.0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        seen = view.depth if window == 1 else minimum_filter(view.depth, window)
         depth = np.zeros(len(points))
-        depth[inside] = view.depth[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+        depth[inside] = seen[row[inside].astype(np.int64), column[inside].astype(np.int64)]
         known = depth > 0.0
         behind[known] = np.minimum(behind[known], (z - depth)[known])
     return behind
@@ -311,7 +315,7 @@ def prior_field(
         points = crop.centers()
         proba = guess(points)
         odds = np.log(np.maximum(proba[:, index + 1], tiny) / np.maximum(proba[:, 0], tiny))
-        odds[hidden_depth(points, views) < -_SEEN] = -MOST
+        odds[hidden_depth(points, views, _WINDOW) < -_SEEN] = -MOST
         grids.append(np.clip(odds, -MOST, MOST).reshape(SIDE, SIDE, SIDE).astype(np.float32))
         corners += [points.min(axis=0), points.max(axis=0)]
     lower, upper = np.min(corners, axis=0) - _AROUND, np.max(corners, axis=0) + _AROUND
@@ -320,7 +324,7 @@ def prior_field(
     nodes = lower + step * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
     # Of each object, so that all together say `occupancy`.
     unknown = math.log(occupancy / (1.0 - occupancy) / len(crops))
-    flat = np.where(hidden_depth(nodes, views) < -_SEEN, -MOST, unknown)
+    flat = np.where(hidden_depth(nodes, views, _WINDOW) < -_SEEN, -MOST, unknown)
     return PriorField(
         np.stack([crop.T_voxel_world() for crop in crops]),
         np.stack(grids),

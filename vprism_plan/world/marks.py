@@ -111,7 +111,8 @@ class Evidence:
         return Lattice(nodes, grid.first * CELLS, CELLS)
 
     def _seen(self, grid: Grid, objects: Nodes | None, step: float) -> Iterator[Surface]:
-        """Marks, points and half the widths of what was seen, the less important first."""
+        """Marks, points and half the widths of what was seen, the less important first: an
+        object's own marks go where its contact is allowed, and what they cover with them."""
         yield MARKED["background"], *self._clutter
         for k, points, half in self._surfaces:
             kept: Any = slice(None)

@@ -35,7 +35,7 @@ from vprism_plan.world.sources import LAST_MARK, MARKED, SUPPORT, object_id
 
 _log = logging.getLogger(__name__)
 
-_MAX_OBJECTS = 250
+_MAX_OBJECTS = min(250, 255 - LAST_MARK)  # marks are bytes
 
 
 class World:
