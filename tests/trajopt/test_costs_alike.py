@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from vprism_plan._kernels import trajopt as kernels
 from vprism_plan.errors import ConfigError, MapError, RobotError
 from vprism_plan.trajopt import (
     ClearanceCost,
@@ -18,6 +19,14 @@ from vprism_plan.trajopt import (
     SelfCollisionCost,
     SmoothnessCost,
     SumCost,
+)
+from vprism_plan.trajopt.cost import (
+    MAX_PARTS,
+    MAX_TURN,
+    PathKernels,
+    Subdivision,
+    sample_paths,
+    turning_joints,
 )
 
 # Steps of finite differences; those of the exact posterior find features that end at a cutoff.
@@ -93,6 +102,19 @@ def test_kernels_and_torch_agree(costs, colliding, name):
         found.append((value.detach(), *torch.autograd.grad(value.sum(), q)))
     for a, b in zip(*found, strict=True):
         assert torch.allclose(a, b, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("waypoints", [1, 2, 3])
+@pytest.mark.parametrize(("spacing", "parts"), [(0.01, None), (1.0, None), (0.05, 3)])
+def test_kernels_divide_edges_as_torch_does(arm, colliding, spacing, parts, waypoints):
+    q = colliding[:, :waypoints]
+    fast = PathKernels(arm)
+    expected = sample_paths(arm, q, Subdivision(spacing, parts), fast.sphere_centers)
+    how = turning_joints(arm), spacing, MAX_TURN, MAX_PARTS, parts or 0
+    found = [kernels.divide(Q, fast.floats, fast.ints, *how) for Q in q.numpy()]
+    rows, _, _, weights = map(np.concatenate, zip(*found, strict=True))
+    np.testing.assert_array_equal(rows, expected.q)
+    np.testing.assert_array_equal(weights, expected.weight)
 
 
 def test_torch_alone_on_request(arm_checker):

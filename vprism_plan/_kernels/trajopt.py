@@ -111,6 +111,56 @@ def pull_all(T, centers, frames, forces, rf, ri, grad):
         grad[n] = _wrench_gradient(T[n], rf, ri, W)
 
 
+@njit(cache=True, nogil=True)
+def divide(Q, rf, ri, turns, spacing, max_turn, most, fixed):
+    """Samples q, edge, fraction, weight of one trajectory Q (T, dof), as `sample_paths` has them.
+
+    turns (dof,): joints whose turn counts; fixed: parts of every edge, 0 is as many as needed.
+    """
+    edges = len(Q) - 1
+    parts = np.full(edges + 1, max(fixed, 1))
+    if fixed == 0:
+        T = np.empty((ri[0], 12))
+        C = np.empty((2, 3, ri[1]))
+        for e in range(edges + 1):
+            fk_frames(Q[e], rf, ri, T)
+            for link in range(ri[2]):
+                place_link(link, T, rf, ri, C[e & 1])
+            if e > 0:
+                square = 0.0
+                for s in range(ri[1]):
+                    x = C[1, 0, s] - C[0, 0, s]
+                    y = C[1, 1, s] - C[0, 1, s]
+                    z = C[1, 2, s] - C[0, 2, s]
+                    square = max(square, x * x + y * y + z * z)
+                wanted = math.sqrt(square) / spacing
+                for j in range(ri[4]):
+                    if turns[j]:
+                        wanted = max(wanted, abs(Q[e, j] - Q[e - 1, j]) / max_turn)
+                parts[e - 1] = max(1, math.ceil(min(wanted, float(most))))
+    parts[edges] = 1  # the last waypoint is an edge that goes nowhere
+    n = parts.sum()
+    q, edge = np.empty((n, ri[4])), np.empty(n, np.int64)
+    fraction, weight = np.empty(n), np.empty(n)
+    i = 0
+    before = 0.0
+    for e in range(edges + 1):
+        own = 1.0 / (parts[e] * edges) if e < edges else 0.0
+        for k in range(parts[e]):
+            edge[i] = e
+            fraction[i] = k / parts[e]
+            weight[i] = 0.5 * (own + (own if k > 0 else before))
+            for j in range(ri[4]):
+                q[i, j] = Q[e, j]
+                if k > 0:
+                    q[i, j] += fraction[i] * (Q[e + 1, j] - Q[e, j])
+            i += 1
+        before = own
+    if edges == 0:
+        weight[0] = 1.0
+    return q, edge, fraction, weight
+
+
 # --- fields ------------------------------------------------------------------------
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from vprism_plan._arguments import number, whole
@@ -160,15 +160,12 @@ class Samples:
     Attributes:
         q: (M, dof), attached to the waypoints.
         trajectory: (M,) which trajectory each belongs to.
-        edge, fraction: (M,) the waypoint before each, and how far it is to the next one.
         weight: (M,) its share of the time (trapezoid rule); sums to 1 per trajectory.
         count: number of trajectories.
     """
 
     q: Float[Tensor, "m dof"]
     trajectory: Int[Tensor, " m"]
-    edge: Int[Tensor, " m"]
-    fraction: Float[Tensor, " m"]
     weight: Float[Tensor, " m"]
     count: int
 
@@ -203,6 +200,13 @@ def require_dof(robot: Any, q: Tensor) -> None:
         )
 
 
+def turning_joints(robot: Any) -> Bool[np.ndarray, " dof"]:
+    """Return which joints turn (and do not slide) a frame."""
+    turning = np.zeros(robot.dof, dtype=np.bool_)
+    turning[robot.arrays.q_index[robot.arrays.kind == 1]] = True
+    return turning
+
+
 def sample_paths(
     robot: Any,
     q: Float[Tensor, "b time dof"],
@@ -229,7 +233,7 @@ def sample_paths(
     if time == 1:
         weight = torch.ones_like(weight)
     rows = q.reshape(-1, dof)[edge] + fraction[:, None] * delta.reshape(-1, dof)[edge]
-    return Samples(rows, edge // time, edge % time, fraction, weight, trajectories)
+    return Samples(rows, edge // time, weight, trajectories)
 
 
 def _parts(
@@ -237,14 +241,12 @@ def _parts(
 ) -> Int[Tensor, "b steps"]:
     if subdivision.parts is not None or delta.shape[1] == 0:
         return delta.new_full(delta.shape[:2], subdivision.parts or 0, dtype=torch.int64)
-    arrays = robot.arrays
     with torch.no_grad():
         centers = (centers_of or robot.sphere_centers)(q.reshape(-1, q.shape[-1]))
     centers = centers.reshape(*q.shape[:2], *centers.shape[1:])
     x, y, z = centers.diff(dim=1).unbind(dim=-1)  # nine times as fast as a sum over three
     way = (x * x + y * y + z * z).amax(dim=-1).sqrt()
-    turning = torch.zeros(q.shape[-1], dtype=torch.bool, device=q.device)
-    turning[torch.as_tensor(arrays.q_index[arrays.kind == 1], device=q.device)] = True
+    turning = torch.as_tensor(turning_joints(robot), device=q.device)
     turn = torch.where(turning, delta.abs(), 0.0).amax(dim=-1)
     wanted = torch.maximum(way / subdivision.spacing, turn / MAX_TURN)
     return wanted.clamp(max=MAX_PARTS).ceil().clamp(min=1).long()
@@ -271,19 +273,23 @@ class PathKernels:
     def __init__(self, robot: Any, rules: Int[np.ndarray, " l"] | None = None) -> None:
         packed = pack_robot(robot.arrays, rules=rules)
         self.floats, self.ints, self._robot = packed.floats, packed.ints, robot
+        self._turns = turning_joints(robot)
 
-    def costs(self, q: Tensor, samples: Samples, kernel: Kernel, plain: Plain) -> Tensor:
-        """Return costs (b,) of trajectories; second derivatives are those of `plain`."""
+    def costs(
+        self, q: Float[Tensor, "b time dof"], division: Subdivision, kernel: Kernel, plain: Plain
+    ) -> Float[Tensor, " b"]:
+        """Return costs of trajectories; second derivatives are those of `plain`."""
         _require_finite(q)
-        own = (samples.q, samples.edge, samples.fraction, samples.weight)
-        arrays, parts = [values.detach().numpy() for values in own], samples.parts
+        spacing, fixed = float(division.spacing), int(division.parts or 0)
+        how = self._turns, spacing, MAX_TURN, MAX_PARTS, fixed
 
         def work(Q: np.ndarray) -> tuple[np.ndarray, Pull]:
             values, grad = np.empty(len(Q)), np.zeros(Q.shape)
 
             def piece(some: slice) -> None:
                 for b in range(some.start, some.stop):
-                    values[b] = kernel(grad[b], *(array[parts[b]] for array in arrays))
+                    samples = kernels.divide(Q[b], self.floats, self.ints, *how)
+                    values[b] = kernel(grad[b], *samples)
 
             run_chunked(piece, len(Q), _AT_ONCE)
             return values, lambda output: output[:, None, None] * grad

@@ -79,10 +79,8 @@ class SphereCost(TrajectoryCost):
         flat = q.reshape(-1, *q.shape[-2:])
         fast = self._compiled if q.device.type == "cpu" else None
         if fast is not None and self._kernel is not None:
-            rows = flat.detach().to(torch.float64)
-            samples = sample_paths(self.robot, rows, self.subdivision, fast.sphere_centers)
             plain = partial(self._costs, fast=None)
-            costs = fast.costs(flat, samples, self._kernel, plain)
+            costs = fast.costs(flat, self.subdivision, self._kernel, plain)
         else:
             costs = self._costs(flat, fast)
         return costs.reshape(q.shape[:-2])
