@@ -8,22 +8,29 @@ Examples go to the data folder, scene by scene; started again, it goes on where 
 
 import argparse
 import multiprocessing
+import sys
 import time
 from pathlib import Path
 
 from experiments.prior.data import Examples, data_files, write
 from experiments.prior.training import train
+from experiments.tables.scoring import commit
 from vprism_plan.mapping.shape_network import ShapeNetwork
 
 WEIGHTS = Path(__file__).parents[2] / "vprism_plan" / "data" / "shape_prior.safetensors"
 
 
 def save_network(network: ShapeNetwork, path: Path) -> None:
-    """Write the weights, float16."""
+    """Write the weights, float16, and where they come from."""
     import torch
     from safetensors.torch import save_file
 
-    save_file({k: v.to(torch.float16).contiguous() for k, v in network.state_dict().items()}, path)
+    origin = {
+        "command": f"python -m experiments.prior {' '.join(sys.argv[1:])}",
+        "commit": commit(),
+    }
+    state = network.state_dict()
+    save_file({k: v.to(torch.float16).contiguous() for k, v in state.items()}, path, origin)
 
 
 def main() -> int:
