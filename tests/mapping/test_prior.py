@@ -39,7 +39,7 @@ def textbook(field, points):
         flat = trilinear(field.elsewhere, field.T_node_world @ [*point, 1.0])
         places = [pose @ [*point, 1.0] for pose in field.T_voxel_world]
         shares = [
-            min(max(min(*at, *(SIDE - 1.0 - at)) / 3.0, 0.0), 1.0) for at in places
+            min(max(min(*at, *(SIDE - 1.0 - at)) / 2.0, 0.0), 1.0) for at in places
         ]  # of an object's own grid, from its side inwards
         for k, (at, share) in enumerate(zip(places, shares, strict=True)):
             other = (1.0 - max(shares)) * flat + max(shares) * -MOST
