@@ -91,7 +91,7 @@ def seen():
     camera = Camera.orbit(np.array([0.0, 0.0, 0.08]), 0.8, np.pi, 0.6)
     scene = Scene((box, bar, clutter), (1, 1, 0), camera, None, 3)
     # A wide kernel forgets what is thin; the default's narrow one holds most of the bar.
-    return scene, vp.fit_map(scene.observation, vp.MapConfig.fine())
+    return scene, vp.fit_map(scene.observation, vp.MapConfig.fine(), prior=None)
 
 
 def only(checker, meshes, q):

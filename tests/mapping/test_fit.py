@@ -92,7 +92,7 @@ def test_a_rigid_motion_moves_the_map_along(scene, coarse):
             obs.depth, obs.labels, obs.intrinsics, transform @ obs.pose,
             plane=plane.transformed(transform),
         )  # fmt: skip
-        maps.append(fit_map(view, config))
+        maps.append(fit_map(view, config, prior=None))
     query = grid_over(scene, 0.03)
     moved = query @ motion[:3, :3].T + motion[:3, 3]
     difference = maps[0].occupancy(query) - maps[1].occupancy(moved)
@@ -111,7 +111,7 @@ def test_two_views_in_one_fit_beat_one(scene, second_view, small_map, coarse):
 def test_an_update_is_near_the_joint_fit(scene, second_view, small_map, coarse):
     grid = grid_over(scene)
     updated = small_map.update(second_view)
-    joint = fit_map([scene.observation, second_view], coarse, seed=1)
+    joint = fit_map([scene.observation, second_view], coarse, seed=1, prior=None)
     assert updated.views == (*small_map.views, second_view)
     assert len(small_map.views) == 1
     assert np.abs(updated.occupancy(grid) - joint.occupancy(grid)).mean() < 0.08

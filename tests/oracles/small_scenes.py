@@ -35,4 +35,4 @@ def small_config(**changes):
 
 def small_map(**changes):
     """The map of the small scene."""
-    return fit_map(small_scene().observation, small_config(**changes), seed=0)
+    return fit_map(small_scene().observation, small_config(**changes), seed=0, prior=None)

@@ -197,13 +197,14 @@ def test_a_mask_one_pixel_too_wide_made_a_mesh_of_33_cm():
     from vprism_plan.world import extract_meshes
 
     obs = observe(Scene(boxes=[BOX]))
-    config = MapConfig()
-    true, wide = (
-        extract_meshes(fit_map(labelled(obs, labels), config))[1]
-        for labels in (obs.labels, grown(obs.labels, 1))
-    )
-    assert np.abs(np.ptp(wide.bounds, axis=0) - np.ptp(true.bounds, axis=0)).max() < 0.01
-    assert wide.body_count == true.body_count
+    # A guess of the hidden side may differ by more than a map that guesses nothing.
+    for prior, most in ((None, 0.01), ("shape", 0.03)):
+        true, wide = (
+            extract_meshes(fit_map(labelled(obs, labels), prior=prior))[1]
+            for labels in (obs.labels, grown(obs.labels, 1))
+        )
+        assert np.abs(np.ptp(wide.bounds, axis=0) - np.ptp(true.bounds, axis=0)).max() < most
+        assert wide.body_count == true.body_count
 
 
 # ------------------------------------------------------------------------ see-through objects

@@ -81,7 +81,8 @@ def run_query(command: Command, console: Console) -> int:
 
 def run_robot(command: Command, console: Console) -> int:
     """Read a robot, compare its spheres with its geometry; write what was asked for."""
-    from vprism_plan.robots import Robot, SphereFit
+    from vprism_plan.robots import Robot
+    from vprism_plan.robots.sphere_fit import SphereFit
 
     if command.fit and command.spheres is not None:
         raise ConfigError("--fit does not go with --spheres FILE; leave one of them out")

@@ -293,6 +293,22 @@ def weight_variances(space: FeatureSpace, config: MapConfig) -> Float[np.ndarray
     return variance
 
 
+def correction_variances(
+    space: FeatureSpace, config: MapConfig, depth: Float[np.ndarray, " h"]
+) -> Float[np.ndarray, " m"]:
+    """Return the prior variance of every weight where they correct a guess, the bias last.
+
+    Args:
+        depth: of every hinge behind what was seen, m: from seen to hidden space the variance
+            of a logit falls geometrically.
+    """
+    start, stop = config.prior_depths
+    hidden = np.clip((depth - start) / (stop - start), 0.0, 1.0)
+    assert config.prior_hidden_variance is not None
+    logit = config.prior_seen_variance ** (1.0 - hidden) * config.prior_hidden_variance**hidden
+    return np.append(logit / config.mean_squared_feature_sum, config.bias_variance)
+
+
 def expand_prior(
     old_space: FeatureSpace,
     old: Posterior,

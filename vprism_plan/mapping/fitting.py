@@ -15,6 +15,7 @@ from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import (
     Posterior,
     WeightPrior,
+    correction_variances,
     diagonal_prior,
     expand_prior,
     fit_weights,
@@ -30,6 +31,7 @@ from vprism_plan.mapping.prior import (
     hidden_depth,
     object_crops,
     prior_field,
+    seen_through,
 )
 from vprism_plan.mapping.training_data import (
     box_centers,
@@ -106,16 +108,24 @@ def _fit(
     """`fit_map`; `known` are warnings of an earlier map of some of the views."""
     problem = learning_problem(observations, config, seed)
     views, ids, plane, space = problem.views, problem.object_ids, problem.plane, problem.space
-    guessed = prior is not None and config.prior_hidden_variance is not None
-    weights = _weight_prior(space, config, len(ids) + 1, views if guessed else None)
-    field = None
-    if guessed:
+    weights, field = weight_prior(space, config, len(ids) + 1), None
+    if prior is not None and config.prior_hidden_variance is not None:
+
+        def under_table(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+            sunk, room = problem.data.sunk, config.object_radius
+            low, high = problem.data.lower[sunk], problem.data.upper[sunk]
+            return (plane.signed_distance(points) < 0.0) & outside_boxes(points, low, high, room)
+
         field = prior_field(
             _guessing(prior)(views, ids, plane),
             object_crops(views, ids, plane),
-            views,
+            lambda points: under_table(points) | seen_through(points, views),
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
         )
+        depth = hidden_depth(space.hinges, views)
+        depth[under_table(space.hinges)] = -np.inf  # known, so free to be told
+        variance = correction_variances(space, config, depth)
+        weights = diagonal_prior(space, np.zeros_like(weights.mean), variance)
     posterior = _learn(space, problem.data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
@@ -136,23 +146,6 @@ def _guessing(prior: Prior | str | None) -> Prior:
             "of (views, object_ids, plane)"
         )
     return prior
-
-
-def _weight_prior(
-    space: FeatureSpace, config: MapConfig, classes: int, views: Sequence[Observation] | None
-) -> WeightPrior:
-    """Return the flat prior of the weights, or with views that of a correction to a guess."""
-    flat = weight_prior(space, config, classes)
-    if views is None:
-        return flat
-    # From what is seen to what is hidden, the variance of a logit falls geometrically.
-    start, stop = config.prior_depths
-    hidden = np.clip((hidden_depth(space.hinges, views) - start) / (stop - start), 0.0, 1.0)
-    wide, narrow = config.prior_seen_variance, config.prior_hidden_variance
-    assert narrow is not None
-    logit = wide ** (1.0 - hidden) * narrow**hidden
-    variance = np.append(logit / config.mean_squared_feature_sum, config.bias_variance)
-    return diagonal_prior(space, np.zeros_like(flat.mean), variance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,8 +220,8 @@ def update_map(old: VPrismMap, observation: Observation, prior: Prior | str | No
     (observation,), found = examine((observation,), plane, old.views)
     seen = _object_ids((observation,))
     views = (*old.views, observation)
-    if not set(seen) <= set(old.object_ids):
-        logger.info("new objects in the view: all %d views are fitted together", len(views))
+    if old.prior is not None or not set(seen) <= set(old.object_ids):
+        logger.info("all %d views are fitted together", len(views))
         return _fit(views, config, old.seed, None if old.prior is None else prior, old.warnings)
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
@@ -239,18 +232,16 @@ def update_map(old: VPrismMap, observation: Observation, prior: Prior | str | No
     hinges = np.concatenate([old.space.hinges, added])
     _check_hinge_count(len(hinges), data, config)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
-    fresh = _weight_prior(space, config, old.n_classes, None if old.prior is None else views)
+    fresh = weight_prior(space, config, old.n_classes)
     weights = expand_prior(old.space, old.posterior, space, fresh)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     data = TrainingData(
         data.points, class_of[data.classes], data.lower, data.upper, data.surface,
         data.surface_ids, data.sunk,
     )  # fmt: skip
-    posterior = _learn(space, data, weights, config, old.prior)
+    posterior = _learn(space, data, weights, config, None)
     warnings = tuple(dict.fromkeys([*old.warnings, *found]))
-    return VPrismMap(
-        config, old.object_ids, plane, views, space, posterior, old.seed, warnings, old.prior
-    )
+    return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed, warnings)
 
 
 def training_data(

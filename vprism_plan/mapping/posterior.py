@@ -201,10 +201,10 @@ class VPrismMap:
     def update(self, observation: Observation, prior: Any = "shape") -> "VPrismMap":
         """Return a new map that has also seen `observation` (labelled, in the same world frame).
 
-        The old posterior is the prior; hinge points for ground the old map did not reach
-        enter with the configured prior. If the view shows objects the map does not know,
-        all views are fitted again together: a posterior cannot score a class it never had.
-        Then `prior` is that of `fit_map`, if this map has one.
+        Without a prior of the hidden side the old posterior is the prior of the new one; hinge
+        points for ground the old map did not reach enter with the configured prior. If the view
+        shows objects the map does not know, or the map has a `prior`, whose guess more views
+        change, all views are fitted again together; `prior` is then that of `fit_map`.
 
         Raises:
             ObservationError: the view has no labels or no objects.

@@ -8,13 +8,13 @@ was seen overrules the guess, and what was not leaves it.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
@@ -298,15 +298,25 @@ def hidden_depth(
     return behind
 
 
+def seen_through(
+    points: Float[np.ndarray, "n 3"], views: Sequence[Observation]
+) -> Bool[np.ndarray, " n"]:
+    """Return where a view saw so far past points (m) that no guess puts anything there."""
+    return hidden_depth(points, views, _WINDOW) < -_SEEN
+
+
 def prior_field(
-    guess: Guess, crops: Sequence[Crop], views: Sequence[Observation], occupancy: float
+    guess: Guess,
+    crops: Sequence[Crop],
+    empty: Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]],
+    occupancy: float,
 ) -> PriorField:
-    """Put a guess onto the objects' grids; where the views saw through, nothing is.
+    """Put a guess onto the objects' grids; where space is known to be empty, nothing is.
 
     Args:
         guess: the prior's.
         crops: one per object.
-        views: that it guessed from.
+        empty: which points (m) are seen to be free, or under the table.
         occupancy: P(occupied) where no grid reaches and no view looked.
     """
     grids, corners = [], []
@@ -315,7 +325,7 @@ def prior_field(
         points = crop.centers()
         proba = guess(points)
         odds = np.log(np.maximum(proba[:, index + 1], tiny) / np.maximum(proba[:, 0], tiny))
-        odds[hidden_depth(points, views, _WINDOW) < -_SEEN] = -MOST
+        odds[empty(points)] = -MOST
         grids.append(np.clip(odds, -MOST, MOST).reshape(SIDE, SIDE, SIDE).astype(np.float32))
         corners += [points.min(axis=0), points.max(axis=0)]
     lower, upper = np.min(corners, axis=0) - _AROUND, np.max(corners, axis=0) + _AROUND
@@ -324,7 +334,7 @@ def prior_field(
     nodes = lower + step * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
     # Of each object, so that all together say `occupancy`.
     unknown = math.log(occupancy / (1.0 - occupancy) / len(crops))
-    flat = np.where(hidden_depth(nodes, views, _WINDOW) < -_SEEN, -MOST, unknown)
+    flat = np.where(empty(nodes), -MOST, unknown)
     return PriorField(
         np.stack([crop.T_voxel_world() for crop in crops]),
         np.stack(grids),
