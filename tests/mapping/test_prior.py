@@ -227,6 +227,6 @@ def test_meshes_that_are_no_solids_are_refused():
 
 
 def test_an_unknown_object_keeps_the_flat_prior(scene):
-    guess = MeshPrior({})(scene.observation, scene.observation.object_ids, TABLE)
+    guess = MeshPrior({})([scene.observation], scene.observation.object_ids, TABLE)
     proba = guess(np.zeros((5, 3)))
     np.testing.assert_allclose(proba[:, 0], 1.0 - FLAT_OCCUPANCY)

@@ -22,9 +22,9 @@ from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, joint
 from vprism_plan.world.grid import Vector
 
 # Arrays of joint values: of one configuration, of many, of a path.
-Configuration = Float[np.ndarray, "dof"]
-Rows = Float[np.ndarray, "n dof"]
-Waypoints = Float[np.ndarray, "t dof"]
+Configuration = Float[np.ndarray, " _"]
+Rows = Float[np.ndarray, "_ _"]
+Waypoints = Float[np.ndarray, "_ _"]
 
 _HEADER = 24
 AT_MOST = 200_000  # configurations that one query may ask about

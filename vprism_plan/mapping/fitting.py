@@ -78,7 +78,7 @@ def fit_map(
     observations: Observation | Sequence[Observation],
     config: MapConfig | None = None,
     seed: int = 0,
-    prior: Prior | str | None = "shape",
+    prior: Any = "shape",
 ) -> VPrismMap:
     """Fit a map to one labelled view, or to several views of one scene in one world frame.
 
@@ -102,7 +102,7 @@ def _fit(
     observations: Observation | Sequence[Observation],
     config: MapConfig,
     seed: int,
-    prior: Prior | str | None,
+    prior: Any,
     known: Sequence[str] = (),
 ) -> VPrismMap:
     """`fit_map`; `known` are warnings of an earlier map of some of the views."""
@@ -133,7 +133,7 @@ def _fit(
     )  # fmt: skip
 
 
-def _guessing(prior: Prior | str | None) -> Prior:
+def _guessing(prior: Any) -> Prior:
     """Return the prior that was asked for."""
     if isinstance(prior, str):
         choice("prior", prior, ["shape"], error=MapError)
@@ -145,7 +145,8 @@ def _guessing(prior: Prior | str | None) -> Prior:
             f"prior is a {type(prior).__name__}; give 'shape', None, a MeshPrior, or a function "
             "of (views, object_ids, plane)"
         )
-    return prior
+    asked: Prior = prior
+    return asked
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +212,7 @@ def _views(observations: Any) -> tuple[Observation, ...]:
     return views
 
 
-def update_map(old: VPrismMap, observation: Observation, prior: Prior | str | None) -> VPrismMap:
+def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
     """See `VPrismMap.update`."""
     if not isinstance(observation, Observation):
         raise ObservationError(f"update got a {type(observation).__name__}; give one Observation")

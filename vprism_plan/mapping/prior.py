@@ -10,7 +10,7 @@ was seen overrules the guess, and what was not leaves it.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,20 +106,12 @@ class Crop:
         return points @ pose[:, :3].T + pose[:, 3]
 
 
-class Guess(Protocol):
-    """What some prior thinks of one scene."""
-
-    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
-        """Return P(class) at points (m, world): "empty" first, then the objects; rows sum to 1."""
-
-
-class Prior(Protocol):
-    """Anything that guesses what objects look like where no camera looked."""
-
-    def __call__(
-        self, views: Sequence[Observation], object_ids: tuple[int, ...], plane: Plane
-    ) -> Guess:
-        """Return the guess for labelled views of some objects on a support surface."""
+# What some prior thinks of one scene: points (n, 3), m, world -> P(class), (n, K), "empty" first,
+# then the objects; rows sum to 1.
+Guess = Callable[[np.ndarray], np.ndarray]
+# Anything that guesses what objects look like where no camera looked: labelled views, the ids of
+# their objects and the support surface -> a guess.
+Prior = Callable[[Sequence[Observation], tuple[int, ...], Plane], Guess]
 
 
 class MeshPrior:

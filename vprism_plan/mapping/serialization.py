@@ -139,7 +139,8 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     """Return the map, if all of its parts fit together."""
     from vprism_plan.mapping.posterior import VPrismMap
 
-    config = MapConfig(**meta["config"])
+    lengths = {name: tuple(meta["config"][name]) for name in ("hinge_shift", "prior_depths")}
+    config = MapConfig(**{**meta["config"], **lengths})
     space = FeatureSpace(tensors["hinges"], config.gamma, float.fromhex(meta["radius"]))
     posterior = Posterior(
         tensors["mean"],

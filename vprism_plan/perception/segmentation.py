@@ -31,7 +31,7 @@ from vprism_plan.perception.plane_fitting import fit_plane
 
 logger = logging.getLogger(__name__)
 
-Clusters = Int[np.ndarray, "h w"]
+Clusters = Int[np.ndarray, "_ _"]
 
 _SPECK_PIXELS, _SPECK_AREA = 12, 1e-4
 # Metres around and above the table within which sensor noise is removed.

@@ -24,7 +24,7 @@ from vprism_plan.perception.observation import Observation, to_numpy
 
 logger = logging.getLogger(__name__)
 
-Balls = Float[np.ndarray, "n 4"]
+Balls = Float[np.ndarray, "_ 4"]
 
 # A label is the robot's if so much of what it shows is on the robot's surface: within three
 # standard deviations of the depth noise, and 3 mm by which balls miss a solid's edges.
