@@ -123,7 +123,6 @@ def _fit(
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
         )
         depth = hidden_depth(space.hinges, views)
-        depth[under_table(space.hinges)] = -np.inf  # known, so free to be told
         variance = correction_variances(space, config, depth)
         weights = diagonal_prior(space, np.zeros_like(weights.mean), variance)
     posterior = _learn(space, problem.data, weights, config, field)
