@@ -80,6 +80,6 @@ def shift_lattice(
     for half in _SHIFTS:
         x, y, z = np.array(config.hinge_shift) + 0.5 * config.hinge_spacing * np.array(half)
         shifted = replace(config, hinge_shift=(float(x), float(y), float(z)))
-        fitted = fit_map(scene.observation, shifted, seed=0)
+        fitted = fit_map(scene.observation, shifted, seed=0, prior=None)
         rows.append(sweep_risks(fitted, ends, radius, n_worlds, seed=0))
     return LatticeShift(np.array(rows))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan.errors import MapError
 from vprism_plan.mapping import MapConfig
 from vprism_plan.mapping.fitting import learning_problem
 from vprism_plan.mapping.prior import Guess
@@ -22,6 +23,8 @@ class Guessed:
 
     def predict_proba(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
         """Return P(class) at points (m)."""
+        if not np.isfinite(points).all():
+            raise MapError("points hold NaN or infinity; every coordinate must be finite (m)")
         return self.guess(points)
 
 

@@ -158,11 +158,12 @@ def test_the_report_says_what_the_json_says(stubs, tmp_path):
 
 
 def test_a_claim_about_every_baseline_said_not_which_rows_it_had(stubs, unpainted, tmp_path):
-    _, files = run(tmp_path)  # of seven rows, three
+    _, files = run(tmp_path)  # of nine rows, three
     text = files[-1].read_text()
     assert (
         "Rows of this table that were not computed: OctoMap; Point estimate (SGD); Sigmoid maps, "
-        'one per object; PointSDF. "Every baseline" below stands for Voxel.\n'
+        "one per object; PointSDF; Shape prior's network alone; V-PRISM (ours, flat prior). "
+        '"Every baseline" below stands for Voxel.\n'
     ) in text
     _, files = run(tmp_path, key="presets", methods=("vprism-paper", "vprism"))
     assert "V-PRISM (ours, fine).\n" in files[-1].read_text()

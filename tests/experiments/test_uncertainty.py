@@ -150,7 +150,7 @@ def test_frames_and_pictures_were_fitted_with_other_threads_than_answers(
 
     monkeypatch.setattr(report.method("sgd"), "fit", staticmethod(counted))
     uncertainty.run(["analytic"], 1, 7, store=tmp_path / "s", output=tmp_path / "o")
-    assert used == [1] * (3 + 2 * 2)  # three methods on one frame, two on two scenes
+    assert used == [1] * (5 + 2 * 2)  # five methods on one frame, two on two scenes
     assert worker_count() == 3
 
 

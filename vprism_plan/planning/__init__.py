@@ -3,6 +3,7 @@
 
 from vprism_plan.planning.goals import PoseGoalConfig as PoseGoalConfig
 from vprism_plan.planning.goals import ReachRegion as ReachRegion
+from vprism_plan.planning.objectives import RiskObjective as RiskObjective
 from vprism_plan.planning.objectives import VPrismMinimaxRiskObjective as VPrismMinimaxRiskObjective
 from vprism_plan.planning.objectives import VPrismRiskObjective as VPrismRiskObjective
 from vprism_plan.planning.ompl_adapter import VPrismMotionValidator as VPrismMotionValidator

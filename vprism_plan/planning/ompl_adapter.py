@@ -229,7 +229,7 @@ def _serialisation_works(space: Any, dof: int) -> bool:
 class VPrismStateValidityChecker(ob.StateValidityChecker):
     """OMPL's question "is this state valid?", answered by a checker."""
 
-    def __init__(self, si: Any, checker: CheckerLike) -> None:
+    def __init__(self, si: Any, checker: Any) -> None:
         """Attach `checker` to the space of `si`; PlanningError if that has not one dimension
         per joint, in flat order, or a part that is neither RealVector nor SO2."""
         super().__init__(si)
@@ -286,7 +286,7 @@ class VPrismMotionValidator(ob.MotionValidator):
         checks: number of motions asked about so far.
     """
 
-    def __init__(self, si: Any, checker: CheckerLike) -> None:
+    def __init__(self, si: Any, checker: Any) -> None:
         """Attach `checker` to the space of `si`; errors as for the state checker."""
         super().__init__(si)
         self.checks = 0
