@@ -93,6 +93,13 @@ class VPrismMap:
         return self.config.kernel_length
 
     @property
+    def detail(self) -> float:
+        """Length over which logits may turn, m: the kernel's, or a voxel of the prior's grids."""
+        if self.prior is None:
+            return self.kernel_length
+        return min(self.kernel_length, self.prior.voxel)
+
+    @property
     def cutoff_radius(self) -> float:
         """Distance from a hinge beyond which it has no say, m."""
         return self.space.radius

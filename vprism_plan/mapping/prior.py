@@ -201,6 +201,11 @@ class PriorField:
     T_node_world: Float[np.ndarray, "3 4"]
     elsewhere: Float[np.ndarray, "x y z"]
 
+    @property
+    def voxel(self) -> float:
+        """Edge of the finest grid's voxels, m."""
+        return float(1.0 / np.linalg.norm(self.T_voxel_world[:, 0, :3], axis=1).max())
+
     def logits(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
         """Return the prior means of all logits at points (m), differentiable, on their device."""
         last = self.log_odds.shape[1] - 1

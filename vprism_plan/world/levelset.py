@@ -124,12 +124,15 @@ def lattice_refinement(resolution: float, kernel_length: float) -> int:
 def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     """Cover {P(occupied) >= level} with cells, the finest of them `spacing` (metres) wide.
 
-    `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`.
+    `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`,
+    and may have `detail`, the length over which logits turn where that is shorter.
 
     Raises:
         WorldError: the map says "occupied" where it has no evidence at all, or the cells would fill
             the memory.
     """
+    # Features of a guess are finer than a kernel: cells that start wider would step over them.
+    detail = getattr(map_, "detail", map_.kernel_length)
     if map_.unsupported_occupancy >= level:
         raise WorldError(
             f"P(occupied) is {map_.unsupported_occupancy:.3f} where the map has no evidence, at "
@@ -138,7 +141,7 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         )
     lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map_.support_bounds())
     size = 4
-    while size * spacing <= 0.9 * map_.kernel_length:
+    while size * spacing <= 0.9 * detail:
         size *= 2
     first = np.floor(lower / (spacing * size)).astype(np.int64)
     last = np.ceil(upper / (spacing * size)).astype(np.int64)
@@ -149,7 +152,7 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     while True:
         # Once cells resolve a surface, halves of them are four times as many.
         expected = len(index) * (size // 4) ** 2
-        if size * spacing < 0.25 * map_.kernel_length and expected > _MOST_CELLS:
+        if size * spacing < 0.25 * detail and expected > _MOST_CELLS:
             raise WorldError(
                 f"the surfaces at level {level:g} would take {expected:,} cells of "
                 f"{4 * spacing:g} m (at most {_MOST_CELLS:,}); use a coarser resolution"
@@ -160,7 +163,7 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         evaluations += len(nodes)
         g = values[where].reshape(-1, 3, 3, 3)
         owners = labels[where].reshape(-1, 3, 3, 3)
-        step = spacing * size / map_.kernel_length
+        step = spacing * size / detail
         if size == 2:
             return LevelSet(spacing, (*inner, _border(index, g, owners, step)), evaluations)
         inside, border = _divide(index, size, g, owners, step)
