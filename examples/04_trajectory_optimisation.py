@@ -65,7 +65,7 @@ unsure = EntropyCost(checker, exact=False)
 careful = optimize(checker, START, GOAL, cost=default_cost(checker) + 0.5 * unsure, seeds=3)
 for name, one in (("default cost", result), ("and entropy", careful)):
     nats = float(unsure(torch.from_numpy(one.path)))
-    print(f"{name}: {one.report.path_length:.3f} rad, {nats:.3f} nats on average")
+    print(f"{name}: {one.report.path_length:.3f} rad, {nats:.4f} nats on average")
 
 # %%
 # Above, the hand's paths: how the seeds began, and what was returned. Below, what the returned

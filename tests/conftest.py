@@ -71,6 +71,14 @@ def demo_world(demo_map):
     return vp.World(demo_map)
 
 
+@pytest.fixture(scope="session")
+def flat_world():
+    """World of the bundled scene as a map sees it that guesses nothing."""
+    import vprism_plan as vp
+
+    return vp.World(vp.fit_map(vp.load_observation(vp_data("demo_scene")), prior=None))
+
+
 def vp_data(name: str) -> Path:
     """Path of bundled data."""
     import vprism_plan

@@ -146,7 +146,7 @@ def examples_of(seed: int) -> Examples:
             crop = Crop.around(
                 points, view.camera_center, scene.table, float(rng.uniform(0.9, 1.3))
             )
-            channels = crop_features(crop, used, k, scene.table)
+            channels = crop_features(crop, used, k)
             features.append(np.rint(127.0 * channels).astype(np.int8))
             targets.append(_filled(scene, group, k, crop))
     shape = (SIDE, SIDE, SIDE)

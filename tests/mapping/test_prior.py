@@ -255,3 +255,12 @@ def test_specks_of_a_guess_are_in_the_level_set(scene):
     points = np.ascontiguousarray(points[fitted.occupancy(points) >= 0.5])
     assert len(points) > 8000
     assert (field.lower_bound(points) <= 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("row", "says"), [([0.5, 0.5], "shape"), ([0.5, 0.2, 0.2, 0.2], "sum 1"), ([np.nan] * 4, "NaN")]
+)
+def test_guesses_that_are_no_probabilities_are_refused(scene, coarse, row, says):
+    prior = lambda *_: lambda points: np.tile(row, (len(points), 1))  # noqa: E731
+    with pytest.raises(MapError, match=says):
+        fit_map(scene.observation, coarse, prior=prior)

@@ -40,7 +40,7 @@ def scene_kernel_map(hidden_scene) -> KernelMap:
 @pytest.fixture(scope="session")
 def fitted_map(hidden_scene):
     config = MapConfig(hinge_spacing=0.05, surface_hinges=16, iterations=2)
-    return fit_map(hidden_scene.observation, config, seed=0)
+    return fit_map(hidden_scene.observation, config, seed=0, prior=None)
 
 
 @pytest.fixture(scope="session", params=["formula", "scene", "fitted"])

@@ -302,6 +302,16 @@ def seen_through(
     return hidden_depth(points, views, _WINDOW) < -_SEEN
 
 
+def _checked(proba: Any, shape: tuple[int, int]) -> Float[np.ndarray, "n k"]:
+    """Return a guess as probabilities, or say why it is none."""
+    found = np.array(proba, dtype=np.float64)
+    if found.shape != shape:
+        raise MapError(f"the prior's guess has shape {found.shape}; it must be {shape}")
+    if not (found >= 0.0).all() or not np.allclose(found.sum(axis=1), 1.0, atol=1e-6):
+        raise MapError("the prior's guess is no probability: a row is below 0, NaN or not of sum 1")
+    return found
+
+
 def prior_field(
     guess: Guess,
     crops: Sequence[Crop],
@@ -320,7 +330,7 @@ def prior_field(
     tiny = math.exp(-MOST)
     for index, crop in enumerate(crops):
         points = crop.centers()
-        proba = guess(points)
+        proba = _checked(guess(points), (len(points), len(crops) + 1))
         odds = np.log(np.maximum(proba[:, index + 1], tiny) / np.maximum(proba[:, 0], tiny))
         odds[empty(points)] = -MOST
         grids.append(np.clip(odds, -MOST, MOST).reshape(SIDE, SIDE, SIDE).astype(np.float32))

@@ -35,7 +35,7 @@ _WIDTHS = (12, 32, 64, 96)
 
 
 def crop_features(
-    crop: Crop, views: Sequence[Observation], object_id: int, plane: Plane
+    crop: Crop, views: Sequence[Observation], object_id: int
 ) -> Float[np.ndarray, "c x y z"]:
     """Return what labelled views say of a crop's voxels, float32 within [-1, 1].
 
@@ -163,7 +163,7 @@ def _interpolated(
 
 
 class ShapePrior:
-    """The package's own prior: a network that was shown generated scenes (`docs/mapping.md`).
+    """The package's own prior: a network that was shown generated scenes (`docs/stages/map.md`).
 
     Args:
         weights: a safetensors file of a `ShapeNetwork`; the package's own by default.
@@ -190,7 +190,7 @@ class ShapePrior:
         found = []
         # One at a time: a batch's bits may depend on its size.
         for crop, object_id in zip(crops, object_ids, strict=True):
-            features = torch.from_numpy(crop_features(crop, views, object_id, plane))
+            features = torch.from_numpy(crop_features(crop, views, object_id))
             x = features[None].to(self._device)
             # Five times faster on a CPU than the default layout.
             x = x.contiguous(memory_format=torch.channels_last_3d)
