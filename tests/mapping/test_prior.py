@@ -234,19 +234,27 @@ def test_an_unknown_object_keeps_the_flat_prior(scene):
     np.testing.assert_allclose(proba[:, 0], 1.0 - FLAT_OCCUPANCY)
 
 
-def test_specks_of_a_guess_are_in_the_level_set(scene):
+def specks(rng, classes):
+    """Balls of 6 mm in the air."""
+    tree = cKDTree(rng.uniform([-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (400, 3)))
+    return lambda points: split(np.where(tree.query(points)[0] < 0.006, 0.98, 0.02), classes)
+
+
+def noise(rng, classes):
+    """Every voxel for itself."""
+    values, shares = [0.002, 0.05, 0.6, 0.95], [0.6, 0.2, 0.1, 0.1]
+    return lambda points: split(rng.choice(values, len(points), p=shares), classes)
+
+
+def split(held, classes):
+    return np.column_stack([1.0 - held, *[held / classes] * classes])
+
+
+@pytest.mark.parametrize("adversary", [specks, noise])
+def test_no_speck_of_a_guess_is_outside_the_level_set(scene, adversary):
     """Cells as wide as a kernel stepped over things as small as a voxel: 22 mm of it were free."""
     rng = np.random.default_rng(1)
-    tree = cKDTree(rng.uniform([-0.2, -0.2, 0.02], [0.2, 0.2, 0.2], (400, 3)))
-
-    def specks(views, object_ids, plane):
-        def guess(points):
-            held = np.where(tree.query(points)[0] < 0.006, 0.98, 0.02)
-            return np.column_stack([1.0 - held, *[held / len(object_ids)] * len(object_ids)])
-
-        return guess
-
-    fitted = fit_map(scene.observation, prior=specks)
+    fitted = fit_map(scene.observation, prior=lambda _, ids, plane: adversary(rng, len(ids)))
     world = World(fitted, WorldConfig(occluded="free"))
     field = world.certain_field(level_set=True, seen=False)
     lower, upper = fitted.support_bounds()

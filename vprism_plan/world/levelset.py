@@ -25,6 +25,9 @@ from vprism_plan.world.grid import Chosen, Index, Points, Values
 # How far the second derivatives may exceed their finite-difference estimate.
 _CURVATURE_SAFETY = 2.0
 # Log-odds: covers the jump where a kernel is cut off, and rounding.
+# Of a guess, whose slope changes by s at a voxel's face: half way between nodes at a distance h
+# it lies off a line by s h / 4, off a parabola by 3 s h / 16; the second difference is s h / 2.
+_KINKS = (4.0, 12.0)
 _SLACK = 1e-3
 _CHUNK = 1 << 16
 # Cells of a surface, a kilobyte each: about 3 square metres at a resolution of 1 mm.
@@ -163,10 +166,13 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         evaluations += len(nodes)
         g = values[where].reshape(-1, 3, 3, 3)
         owners = labels[where].reshape(-1, 3, 3, 3)
-        step = spacing * size / detail
+        step = spacing * size / map_.kernel_length
+        safety = _KINKS if detail < map_.kernel_length else (_CURVATURE_SAFETY,) * 2
         if size == 2:
-            return LevelSet(spacing, (*inner, _border(index, g, owners, step)), evaluations)
-        inside, border = _divide(index, size, g, owners, step)
+            return LevelSet(
+                spacing, (*inner, _border(index, g, owners, step, safety[1])), evaluations
+            )
+        inside, border = _divide(index, size, g, owners, step, safety[0])
         inner.append(inside)
         index = border.index
         if len(index) == 0:
@@ -179,12 +185,13 @@ def _divide(
     g: Float[np.ndarray, "n 3 3 3"],
     owners: UInt8[np.ndarray, "n 3 3 3"],
     step: float,
+    safety: float,
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
     spread = np.ptp(g, axis=(1, 2, 3))
     # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
-    slack = _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
+    slack = safety * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
     inside, border = [], []
     for child in _CHILDREN:
         block = (slice(None), *(slice(c, c + 2) for c in child))
@@ -214,6 +221,7 @@ def _border(
     g: Float[np.ndarray, "n 3 3 3"],
     owners: UInt8[np.ndarray, "n 3 3 3"],
     step: float,
+    safety: float,
 ) -> Cells:
     """Divide cells of edge 4, known at every second node, into those of edge 1 that count. The map
     is not evaluated again: a parabola through three nodes at a distance h is off by at most h^3 /
@@ -221,7 +229,7 @@ def _border(
     fine = np.einsum("ai,bj,ck,nijk->nabc", _HALVES, _HALVES, _HALVES, g, optimize=True)
     # Second differences at half the spacing are a quarter of those in `g`.
     spread = np.ptp(g, axis=(1, 2, 3))
-    slack = _CURVATURE_SAFETY * _curvature(g) / 32.0 + 0.3 * step**2 * spread + _SLACK
+    slack = safety * _curvature(g) / 32.0 + 0.3 * step**2 * spread + _SLACK
     kept = []
     for child in np.ndindex(4, 4, 4):
         corners = fine[(slice(None), *(slice(c, c + 2) for c in child))].reshape(len(g), 8)
