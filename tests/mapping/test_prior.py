@@ -178,6 +178,13 @@ def test_a_later_view_changes_the_guess_too(guessed, second_view, scene, hypothe
     assert error[1] < error[0]
 
 
+def test_a_prior_of_your_own_is_not_replaced_in_silence(guessed, second_view, tmp_path):
+    guessed.save(tmp_path / "m.safetensors")
+    for fitted in (guessed, load_map(tmp_path / "m.safetensors")):
+        with pytest.raises(MapError, match="give it again"):
+            fitted.update(second_view)
+
+
 def test_nothing_hangs_under_the_table(scene):
     """The guess of the hidden side once went on below it: meshes reached 2 cm down."""
     fitted = fit_map(scene.observation)

@@ -121,6 +121,7 @@ def _fit(
             object_crops(views, ids, plane),
             lambda points: under_table(points) | seen_through(points, views),
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
+            own=not isinstance(prior, str),
         )
         depth = hidden_depth(space.hinges, views)
         variance = correction_variances(space, config, depth)
@@ -220,6 +221,11 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     (observation,), found = examine((observation,), plane, old.views)
     seen = _object_ids((observation,))
     views = (*old.views, observation)
+    if old.prior is not None and old.prior.own and isinstance(prior, str):
+        raise MapError(
+            "this map's prior is one of your own; give it again: update(view, prior=...), or "
+            "fit_map to ask the package's"
+        )
     if old.prior is not None or not set(seen) <= set(old.object_ids):
         logger.info("all %d views are fitted together", len(views))
         return _fit(views, config, old.seed, None if old.prior is None else prior, old.warnings)

@@ -211,10 +211,12 @@ class VPrismMap:
         Without a prior of the hidden side the old posterior is the prior of the new one; hinge
         points for ground the old map did not reach enter with the configured prior. If the view
         shows objects the map does not know, or the map has a `prior`, whose guess more views
-        change, all views are fitted again together; `prior` is then that of `fit_map`.
+        change, all views are fitted again together; `prior` is then that of `fit_map`: one of your
+        own has to be given again.
 
         Raises:
             ObservationError: the view has no labels or no objects.
+            MapError: the map was made with a prior of your own, and it is not given.
         """
         from vprism_plan.mapping.fitting import update_map
 

@@ -194,12 +194,14 @@ class PriorField:
         log_odds: (C, n, n, n) float32, at the voxels' centres.
         T_node_world: (3, 4) world (m) to nodes of the coarse grid.
         elsewhere: (a, b, c) float32, log-odds of every single object at its nodes.
+        own: whether the prior is the user's, which no file holds: an update must be given it.
     """
 
     T_voxel_world: Float[np.ndarray, "c 3 4"]
     log_odds: Float[np.ndarray, "c n n n"]
     T_node_world: Float[np.ndarray, "3 4"]
     elsewhere: Float[np.ndarray, "x y z"]
+    own: bool = False
 
     @property
     def voxel(self) -> float:
@@ -317,6 +319,7 @@ def prior_field(
     crops: Sequence[Crop],
     empty: Callable[[Float[np.ndarray, "n 3"]], Bool[np.ndarray, " n"]],
     occupancy: float,
+    own: bool,
 ) -> PriorField:
     """Put a guess onto the objects' grids; where space is known to be empty, nothing is.
 
@@ -325,6 +328,7 @@ def prior_field(
         crops: one per object.
         empty: which points (m) are seen to be free, or under the table.
         occupancy: P(occupied) where no grid reaches and no view looked.
+        own: see `PriorField`.
     """
     grids, corners = [], []
     tiny = math.exp(-MOST)
@@ -347,4 +351,5 @@ def prior_field(
         np.stack(grids),
         np.column_stack([np.eye(3), -lower]) / step,
         flat.reshape(shape).astype(np.float32),
+        own,
     )

@@ -38,7 +38,7 @@ _HEADER = "vprism_plan"
 _DIGEST = "sha256"
 _NEEDED_PARTS = ("depth", "labels", "intrinsics")
 _VIEW_PARTS = (*_NEEDED_PARTS, "T_world_camera", "color", "robot_spheres")
-_PRIOR = tuple(field.name for field in fields(PriorField))
+_PRIOR = tuple(field.name for field in fields(PriorField) if field.name != "own")
 _FARTHEST = 1e6  # metres; kernels count cells up to the farthest hinge
 
 
@@ -57,7 +57,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
     }
     prior = fitted.prior
     if prior is not None:
-        tensors |= {f"prior.{name}": array for name, array in vars(prior).items()}
+        tensors |= {f"prior.{name}": getattr(prior, name) for name in _PRIOR}
     for index, view in enumerate(fitted.views):
         for part in _VIEW_PARTS:
             if getattr(view, part) is not None:
@@ -73,6 +73,7 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "max_range": [view.max_range for view in fitted.views],
         "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
+        "own_prior": prior is not None and prior.own,
     }
     arrays = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     if not path.parent.is_dir():
@@ -163,17 +164,19 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
     if not all(isinstance(text, str) for text in warnings):
         raise MapError("warnings must be sentences")
-    prior = _prior(tensors, len(object_ids))
+    prior = _prior(tensors, len(object_ids), meta["own_prior"])
     return VPrismMap(
         config, object_ids, plane, views, space, posterior, meta["seed"], warnings, prior
     )
 
 
-def _prior(tensors: Mapping[str, np.ndarray], objects: int) -> PriorField | None:
+def _prior(tensors: Mapping[str, np.ndarray], objects: int, own: Any) -> PriorField | None:
     """Return the prior's field, if the file has one."""
     if "prior.log_odds" not in tensors:
         return None
-    field = PriorField(**{name: tensors[f"prior.{name}"] for name in _PRIOR})
+    if not isinstance(own, bool):
+        raise MapError(f"own_prior is {own!r}; it must be true or false")
+    field = PriorField(**{name: tensors[f"prior.{name}"] for name in _PRIOR}, own=own)
     expected: dict[str, Any] = {
         "T_voxel_world": ((objects, 3, 4), np.float64),
         "log_odds": ((objects, SIDE, SIDE, SIDE), np.float32),
