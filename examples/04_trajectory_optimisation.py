@@ -62,7 +62,7 @@ for name, path in (("RRTConnect", raw), ("optimised", kept.path)):
 # Costs are torch modules and add up. Here a path is also to stay away from what the map is unsure
 # of, whether or not that is an obstacle; it pays with a little length.
 unsure = EntropyCost(checker, exact=False)
-careful = optimize(checker, START, GOAL, cost=default_cost(checker) + 0.5 * unsure, seeds=3)
+careful = optimize(checker, START, GOAL, cost=default_cost(checker) + 20.0 * unsure, seeds=3)
 for name, one in (("default cost", result), ("and entropy", careful)):
     nats = float(unsure(torch.from_numpy(one.path)))
     print(f"{name}: {one.report.path_length:.3f} rad, {nats:.4f} nats on average")

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
@@ -279,3 +281,18 @@ def test_guesses_that_are_no_probabilities_are_refused(scene, coarse, row, says)
     prior = lambda *_: lambda points: np.tile(row, (len(points), 1))  # noqa: E731
     with pytest.raises(MapError, match=says):
         fit_map(scene.observation, coarse, prior=prior)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), half=st.floats(0.001, 0.04))
+def test_a_guess_stays_within_its_bounds_in_every_cube(field, seed, half):
+    """The level set drops a cube when the guess at its highest does not lift it to the level."""
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform(-0.3, 0.35, (400, 3))
+    low, high = field.bounds(centers, half)
+    assert (high - low < 2.0 * MOST).any()
+    for _ in range(20):
+        inside = centers + half * rng.choice([-1.0, 1.0, rng.uniform(-1.0, 1.0)], centers.shape)
+        logits = field.at(inside)[:, 1:]
+        assert (logits >= low - 1e-5).all()
+        assert (logits <= high + 1e-5).all()

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The promise of the world: no sphere that touches the level set is called free."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from oracles.world_oracles import KernelMap, level_points, random_map
@@ -140,7 +142,11 @@ def test_unknown_object_names_the_valid_ones(any_map, world):
         world.object_field(99)
 
 
-def test_lattice_is_fine_enough_for_the_kernel():
-    assert lattice_refinement(0.01, 0.0224) == 4
-    assert lattice_refinement(0.05, 0.0224) == 16
-    assert lattice_refinement(0.05, 0.0224) * 0.25 * 0.0224 >= 0.05
+def test_lattice_is_fine_enough_for_the_kernel_and_for_the_guess():
+    smooth = SimpleNamespace(kernel_length=0.0224)
+    assert lattice_refinement(0.01, smooth) == 4
+    assert lattice_refinement(0.05, smooth) == 16
+    assert lattice_refinement(0.05, smooth) * 0.25 * 0.0224 >= 0.05
+    guessed = SimpleNamespace(kernel_length=0.0224, detail=0.0075)
+    assert lattice_refinement(0.01, guessed) == 4
+    assert lattice_refinement(0.02, guessed) * 0.45 * 0.0075 >= 0.02

@@ -54,7 +54,7 @@ def covered(cells, points, spacing):
 def test_no_triangle_leaves_the_cover_of_the_level_set(seed):
     """So a mesh on the field's lattice cannot touch what the field calls free."""
     map_, level, resolution = random_map(seed, objects=2), LEVELS[seed % 3], 0.01
-    spacing = resolution / lattice_refinement(resolution, map_.kernel_length)
+    spacing = resolution / lattice_refinement(resolution, map_)
     cover = trace_level_set(map_, spacing, level)
     for mesh in extract_refined_meshes(map_, level, spacing).values():
         assert covered(cover, np.asarray(mesh.triangles_center), spacing).all()

@@ -6,7 +6,8 @@ reach the level in it, kept whole when they cannot fall below it, and divided ot
 of edge h the log-odds g differ from the trilinear interpolation of their corners by at most sum_a
 h^2/8 max|g_aa|; the second derivatives come from the 27 points that dividing the parent evaluates
 anyway. They are finite differences of a smooth function, counted twice: not a proof for an
-arbitrary one.
+arbitrary one. A guess of the map's prior is not smooth: in a cell it counts as its largest, or
+least, value there, until cells resolve it.
 """
 
 import math
@@ -24,10 +25,11 @@ from vprism_plan.world.grid import Chosen, Index, Points, Values
 
 # How far the second derivatives may exceed their finite-difference estimate.
 _CURVATURE_SAFETY = 2.0
-# Log-odds: covers the jump where a kernel is cut off, and rounding.
 # Of a guess, whose slope changes by s at a voxel's face: half way between nodes at a distance h
-# it lies off a line by s h / 4, off a parabola by 3 s h / 16; the second difference is s h / 2.
-_KINKS = (4.0, 12.0)
+# it lies off a parabola by 3 s h / 16; the second difference is s h / 2.
+_KINKS = 12.0
+_RESOLVED = 0.9  # distance of nodes, in voxels of a guess, that steps over none of them
+# Log-odds: covers the jump where a kernel is cut off, and rounding.
 _SLACK = 1e-3
 _CHUNK = 1 << 16
 # Cells of a surface, a kilobyte each: about 3 square metres at a resolution of 1 mm.
@@ -116,26 +118,31 @@ def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Values:
     return np.sum([part.max(axis=(1, 2, 3), initial=0.0) for part in second], axis=0)
 
 
-def lattice_refinement(resolution: float, kernel_length: float) -> int:
+def lattice_refinement(resolution: float, map_: Any) -> int:
     """How many lattice steps a grid step has: 4, or more for a coarse grid; a power of 2."""
+    finest = min(0.25 * map_.kernel_length, 0.5 * _RESOLVED * _detail(map_))
     refinement = 4
-    while resolution / refinement > 0.25 * kernel_length:
+    while resolution / refinement > finest:
         refinement *= 2
     return refinement
+
+
+def _detail(map_: Any) -> float:
+    return getattr(map_, "detail", map_.kernel_length)
 
 
 def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     """Cover {P(occupied) >= level} with cells, the finest of them `spacing` (metres) wide.
 
     `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`,
-    and may have `detail`, the length over which logits turn where that is shorter.
+    and may have a `prior` (`PriorField`) with a `detail` finer than the kernel.
 
     Raises:
         WorldError: the map says "occupied" where it has no evidence at all, or the cells would fill
             the memory.
     """
-    # Features of a guess are finer than a kernel: cells that start wider would step over them.
-    detail = getattr(map_, "detail", map_.kernel_length)
+    detail = _detail(map_)
+    prior = getattr(map_, "prior", None)
     if map_.unsupported_occupancy >= level:
         raise WorldError(
             f"P(occupied) is {map_.unsupported_occupancy:.3f} where the map has no evidence, at "
@@ -144,7 +151,7 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         )
     lower, upper = (np.asarray(corner, dtype=np.float64) for corner in map_.support_bounds())
     size = 4
-    while size * spacing <= 0.9 * detail:
+    while size * spacing <= 0.9 * map_.kernel_length:
         size *= 2
     first = np.floor(lower / (spacing * size)).astype(np.int64)
     last = np.ceil(upper / (spacing * size)).astype(np.int64)
@@ -167,12 +174,16 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         g = values[where].reshape(-1, 3, 3, 3)
         owners = labels[where].reshape(-1, 3, 3, 3)
         step = spacing * size / map_.kernel_length
-        safety = _KINKS if detail < map_.kernel_length else (_CURVATURE_SAFETY,) * 2
         if size == 2:
-            return LevelSet(
-                spacing, (*inner, _border(index, g, owners, step, safety[1])), evaluations
-            )
-        inside, border = _divide(index, size, g, owners, step, safety[0])
+            safety = _CURVATURE_SAFETY if prior is None else _KINKS
+            return LevelSet(spacing, (*inner, _border(index, g, owners, step, safety)), evaluations)
+        least = most = g
+        if prior is not None:
+            guess = prior.at(nodes * spacing)[where, 1:]
+            low, high = prior.bounds(spacing * (index + size), spacing * size)
+            most = g + (high[:, None] - guess).max(axis=2).reshape(g.shape)
+            least = g - (guess - low[:, None]).max(axis=2).reshape(g.shape)
+        inside, border = _divide(index, size, g, owners, (least, most), step)
         inner.append(inside)
         index = border.index
         if len(index) == 0:
@@ -184,34 +195,45 @@ def _divide(
     size: int,
     g: Float[np.ndarray, "n 3 3 3"],
     owners: UInt8[np.ndarray, "n 3 3 3"],
+    bounds: tuple[Float[np.ndarray, "n 3 3 3"], Float[np.ndarray, "n 3 3 3"]],
     step: float,
-    safety: float,
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
-    spread = np.ptp(g, axis=(1, 2, 3))
-    # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
-    slack = safety * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
+    least, most = bounds
+    below, above = (_slack(part, step) for part in bounds)
     inside, border = [], []
     for child in _CHILDREN:
         block = (slice(None), *(slice(c, c + 2) for c in child))
-        corners = g[block].reshape(len(g), 8)
-        label, around = _ownership(corners, owners[block].reshape(len(g), 8), slack)
+        label, around = _ownership(
+            g[block].reshape(-1, 8), most[block].reshape(-1, 8), owners[block].reshape(-1, 8), above
+        )
         cells = Cells(index + child * size, size, label, around)
-        whole = (corners.min(axis=1) >= slack) & (around == around[:, :1]).all(axis=1)
+        whole = least[block].min(axis=(1, 2, 3)) >= below
+        whole &= (around == around[:, :1]).all(axis=1)
         inside.append(cells.select(whole))
-        border.append(cells.select((corners.max(axis=1) >= -slack) & ~whole))
+        border.append(cells.select((most[block].max(axis=(1, 2, 3)) >= -above) & ~whole))
     return _join(inside), _join(border)
 
 
+def _slack(g: Float[np.ndarray, "n 3 3 3"], step: float) -> Values:
+    """By how much log-odds in a cell may exceed those at the corners of its eighths."""
+    # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
+    spread = np.ptp(g, axis=(1, 2, 3))
+    return _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
+
+
 def _ownership(
-    corners: Float[np.ndarray, "n 8"], owners: UInt8[np.ndarray, "n 8"], slack: Values
+    corners: Float[np.ndarray, "n 8"],
+    most: Float[np.ndarray, "n 8"],
+    owners: UInt8[np.ndarray, "n 8"],
+    slack: Values,
 ) -> tuple[UInt8[np.ndarray, " n"], UInt8[np.ndarray, "n 8"]]:
     """Owner at the most occupied corner, and at all corners that may be occupied: counted
     elsewhere, the skin of one object would belong to another."""
     best = corners.argmax(axis=1)
     rows = np.arange(len(corners))
-    around = np.where(corners >= -slack[:, None], owners, np.uint8(0))
+    around = np.where(most >= -slack[:, None], owners, np.uint8(0))
     around[rows, best] = owners[rows, best]
     return owners[rows, best], around
 
@@ -236,7 +258,7 @@ def _border(
         chosen = corners.max(axis=1) >= -slack
         block = (chosen, *(slice(c // 2, c // 2 + 2) for c in child))
         evaluated, owner = g[block].reshape(-1, 8), owners[block].reshape(-1, 8)
-        label, around = _ownership(evaluated, owner, slack[chosen])
+        label, around = _ownership(evaluated, evaluated, owner, slack[chosen])
         kept.append(Cells(index[chosen] + np.array(child), 1, label, around))
     return _join(kept)
 

@@ -91,7 +91,7 @@ class World:
         )
         self.plane_names, self.planes = self._half_spaces()
         choose_grid(map, self.config, None)  # tracing for a grid too large even so takes minutes
-        self._factor = lattice_refinement(self.config.resolution, map.kernel_length)
+        self._factor = lattice_refinement(self.config.resolution, map)
         fine = self.config.resolution / self._factor
         self._level_set = self._timed("level set", trace_level_set, map, fine, self.config.level)
         box = self._level_set.box()

@@ -346,7 +346,7 @@ class MeshWorld:
     def __init__(self, world: Any, resolution: float | None = None) -> None:
         config = world.config
         if resolution is None:
-            refinement = lattice_refinement(config.resolution, world.map.kernel_length)
+            refinement = lattice_refinement(config.resolution, world.map)
             resolution = config.resolution / refinement
         self.map = world.map
         self.level = float(config.level)
