@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Make the data of the shape prior, train its network, write the weights.
 
-    python -m experiments.prior [--scenes 1200] [--steps 9000] [--data DIR] [--output FILE]
+    python -m experiments.prior [--scenes 1200] [--steps 9000] [--data DIR] [--start FILE]
 
 Examples go to the data folder, scene by scene; started again, it goes on where it stopped.
 """
@@ -15,20 +15,31 @@ from pathlib import Path
 from experiments.prior.data import Examples, data_files, write
 from experiments.prior.training import train
 from experiments.tables.scoring import commit
-from vprism_plan.mapping.shape_network import ShapeNetwork
+from vprism_plan.mapping.shape_network import ShapeNetwork, ShapePrior
 
 WEIGHTS = Path(__file__).parents[2] / "vprism_plan" / "data" / "shape_prior.safetensors"
 
 
-def save_network(network: ShapeNetwork, path: Path) -> None:
-    """Write the weights, float16, and where they come from."""
-    import torch
-    from safetensors.torch import save_file
+def origin_of(start: Path | None) -> dict[str, str]:
+    """Return the command and the commit, behind those that weights to start from came from."""
+    from safetensors import safe_open
 
     origin = {
         "command": f"python -m experiments.prior {' '.join(sys.argv[1:])}",
         "commit": commit(),
     }
+    if start is None:
+        return origin
+    with safe_open(start, "pt") as weights:
+        former = weights.metadata()
+    return {name: f"{former[name]}; then {origin[name]}" for name in origin}
+
+
+def save_network(network: ShapeNetwork, path: Path, origin: dict[str, str]) -> None:
+    """Write the weights, float16, and where they come from."""
+    import torch
+    from safetensors.torch import save_file
+
     state = network.state_dict()
     save_file({k: v.to(torch.float16).contiguous() for k, v in state.items()}, path, origin)
 
@@ -41,8 +52,10 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=Path("build/prior"))
     parser.add_argument("--steps", type=int, default=9000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--output", type=Path, default=WEIGHTS)
     chosen = parser.parse_args()
+    origin = origin_of(chosen.start)
     held_out, files = data_files(chosen.scenes, chosen.data)
     chosen.data.mkdir(parents=True, exist_ok=True)
     makers = multiprocessing.get_context("spawn").Pool(chosen.jobs)
@@ -56,11 +69,12 @@ def main() -> int:
         chosen.seed,
         chosen.jobs,
         lambda line: print(line, flush=True),  # noqa: T201
-        lambda found: save_network(found, chosen.data / "latest.safetensors"),
+        lambda found: save_network(found, chosen.data / "latest.safetensors", origin),
+        None if chosen.start is None else ShapePrior(chosen.start).network,
     )
     making.get()
     makers.close()
-    save_network(network, chosen.output)
+    save_network(network, chosen.output, origin)
     return 0
 
 

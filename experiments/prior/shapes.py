@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Household-like shapes, made on the spot: what the shape prior learns from.
 
-Surfaces of revolution (bottles, cans, bowls, cups with handles), tapered and bent
-superquadrics, extruded outlines (L-shapes, rings, plates), open cartons, and unions of
-these. None is taken from a set that anything is evaluated on.
+Surfaces of revolution (bottles, cans, bowls, cups with handles), round or squeezed, tapered and
+bent superquadrics, bent tubes (bananas, hooks, handles), extruded outlines (L-shapes, rings,
+plates), flat and open cartons, and unions of these. None is taken from a set that anything is evaluated on.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,38 @@ def _revolved(rng: Rng) -> trimesh.Trimesh:
         radius = np.ones(24)
     height = np.linspace(0.0, rng.uniform(0.5, 4.0), 24)
     line = np.stack([np.r_[0.0, radius, 0.0], np.r_[height[0], height, height[-1]]], axis=1)
-    return trimesh.creation.revolve(line, sections=_SEGMENTS)
+    body = trimesh.creation.revolve(line, sections=_SEGMENTS)
+    if rng.random() < 0.35:  # flat bottles of mustard, shampoo, detergent
+        body.apply_scale([1.0, rng.uniform(0.35, 0.9), 1.0])
+    return body
+
+
+def _swept(rng: Rng) -> trimesh.Trimesh:
+    """A tube along a bent line, thinner towards its ends: bananas, hooks, handles, straps."""
+    bend = rng.uniform(0.0, 2.2)  # radians from end to end
+    angles = np.linspace(-0.5, 0.5, 20) * bend
+    step = np.stack([np.sin(angles), np.zeros(20), np.cos(angles)], axis=1) / 19.0
+    line = np.cumsum(step, axis=0)
+    thick = rng.uniform(0.05, 0.2)
+    radius = thick * np.interp(np.linspace(0, 1, 20), np.linspace(0, 1, 5), rng.uniform(0.6, 1, 5))
+    ends = np.sin(np.pi * np.linspace(0.04, 0.96, 20)) ** rng.uniform(0.0, 0.6)
+    turn = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
+    across = np.stack([np.cos(angles), np.zeros(20), -np.sin(angles)], axis=1)
+    side = rng.uniform(0.6, 1.4) * np.array([0.0, 1.0, 0.0])
+    rings = line[:, None] + (radius * ends)[:, None, None] * (
+        np.cos(turn)[None, :, None] * across[:, None] + np.sin(turn)[None, :, None] * side
+    )
+    vertices = np.concatenate([rings.reshape(-1, 3), line[:1], line[-1:]])
+    around = (np.arange(16) + 1) % 16
+    faces = []
+    for k in range(19):
+        a, b = 16 * k + np.arange(16), 16 * k + around
+        faces += [np.stack([a, b, b + 16], axis=1), np.stack([a, b + 16, a + 16], axis=1)]
+    faces.append(np.stack([np.full(16, 320), around, np.arange(16)], axis=1))
+    faces.append(np.stack([np.full(16, 321), 304 + np.arange(16), 304 + around], axis=1))
+    mesh = trimesh.Trimesh(vertices, np.concatenate(faces))
+    trimesh.repair.fix_normals(mesh)
+    return mesh
 
 
 def _hollow(rng: Rng) -> trimesh.Trimesh:
@@ -123,6 +154,8 @@ def _extruded(rng: Rng) -> trimesh.Trimesh:
 def _carton(rng: Rng) -> trimesh.Trimesh:
     """A box: closed, open above, or with a flap."""
     size = rng.uniform(0.3, 1.0, 3)
+    if rng.random() < 0.4:  # crackers, gelatin, books
+        size[int(rng.integers(3))] = rng.uniform(0.12, 0.35)
     body = trimesh.creation.box(size)
     kind = rng.choice(["closed", "open", "flap"], p=[0.6, 0.2, 0.2])
     if kind == "open":
@@ -154,10 +187,10 @@ def _joined(rng: Rng) -> trimesh.Trimesh:
 
 
 _SINGLE: tuple[Callable[[Rng], Any], ...] = (
-    _revolved, _hollow, _superquadric, _extruded, _carton,
+    _revolved, _hollow, _superquadric, _extruded, _carton, _swept,
 )  # fmt: skip
 _FAMILIES = (*_SINGLE, _joined)
-_SHARES = (0.25, 0.12, 0.15, 0.2, 0.15, 0.13)
+_SHARES = (0.23, 0.1, 0.12, 0.15, 0.16, 0.09, 0.15)
 
 
 class MadeShapes:

@@ -73,14 +73,21 @@ def train(
     threads: int,
     log: Callable[[str], None],
     keep: Callable[[ShapeNetwork], None],
+    start: ShapeNetwork | None = None,
 ) -> ShapeNetwork:
-    """Return the averaged network after `steps` batches; calls `keep` with it now and then."""
+    """Return the averaged network after `steps` batches; calls `keep` with it now and then.
+
+    From random weights, or from those of `start`, then at two thirds of the rate.
+    """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     network = _fast(ShapeNetwork())
+    if start is not None:
+        network.load_state_dict(start.state_dict())
+    rate = _RATE if start is None else 2.0 / 3.0 * _RATE
     average = _fast(ShapeNetwork())
     average.load_state_dict(network.state_dict())
-    optimizer = torch.optim.AdamW(network.parameters(), lr=_RATE, weight_decay=_DECAY)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=_DECAY)
     pool = Pool(files, rng)
     since, total = time.monotonic(), 0.0
     for step in range(steps):
@@ -88,7 +95,7 @@ def train(
         torch.set_num_threads(threads if pool.complete else 1)  # the others make the data
         share = min((step + 1) / _WARM_UP, 0.5 * (1.0 + math.cos(math.pi * step / steps)))
         for group in optimizer.param_groups:
-            group["lr"] = _RATE * share
+            group["lr"] = rate * share
         x, y = _tensors(batch, slice(None), bool(rng.random() < 0.5))
         loss = _loss(network, x, y)
         optimizer.zero_grad()

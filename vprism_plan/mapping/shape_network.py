@@ -169,17 +169,20 @@ class ShapePrior:
         weights: a safetensors file of a `ShapeNetwork`; the package's own by default.
         device: where the network runs.
 
+    Attributes:
+        network: the one that was read.
+
     Raises:
         MapError: the file holds no such network.
     """
 
     def __init__(self, weights: str | Path | None = None, device: str = "cpu") -> None:
         path = data_path("shape_prior.safetensors") if weights is None else Path(weights)
-        self._network = ShapeNetwork()
+        self.network = ShapeNetwork()
         with reading(path, "the weights of a shape prior", MapError):
             state = {name: value.float() for name, value in load_file(path).items()}
-            self._network.load_state_dict(state)
-        self._network.eval().to(device)
+            self.network.load_state_dict(state)
+        self.network.eval().to(device)
         self._device = device
 
     def __call__(
@@ -195,5 +198,5 @@ class ShapePrior:
             # Five times faster on a CPU than the default layout.
             x = x.contiguous(memory_format=torch.channels_last_3d)
             with torch.no_grad():
-                found.append(self._network(x)[0].double().cpu().numpy())
+                found.append(self.network(x)[0].double().cpu().numpy())
         return NetworkGuess(crops, np.stack(found))
