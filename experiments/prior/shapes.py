@@ -3,7 +3,8 @@
 
 Surfaces of revolution (bottles, cans, bowls, cups with handles), round or squeezed, tapered and
 bent superquadrics, bent tubes (bananas, hooks, handles), extruded outlines (L-shapes, rings,
-plates), flat and open cartons, and unions of these. None is taken from a set that anything is evaluated on.
+plates), flat and open cartons, and unions of these. None is taken from a set that anything is
+evaluated on.
 """
 
 from collections.abc import Callable

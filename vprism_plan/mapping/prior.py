@@ -252,8 +252,9 @@ class PriorField:
         other_low = np.where(touched.any(axis=1), -MOST, flat_low)[:, None]
         other_high = np.where(held.any(axis=1), -MOST, flat_high)[:, None]
         low, high = (np.stack([grid[k] for grid in grids], axis=1) for k in (0, 1))
-        low = np.where(held, low, np.where(touched, np.minimum(low, other_low), other_low))
-        return low, np.where(held, high, np.where(touched, np.maximum(high, other_high), other_high))
+        mixed_low = np.where(touched, np.minimum(low, other_low), other_low)
+        mixed_high = np.where(touched, np.maximum(high, other_high), other_high)
+        return np.where(held, low, mixed_low), np.where(held, high, mixed_high)
 
 
 def _extremes(
