@@ -24,8 +24,7 @@ class PathCase(Stored):
     """One path: how many of the worlds object to it, and what the solids say.
 
     Attributes:
-        hits: worlds in which a ball of the sweep touches anything (`PosteriorWorlds.touched`:
-            an occupied voxel counts as the ball inscribed in it).
+        hits: worlds in which a ball of the sweep touches anything (`PosteriorWorlds.touched`).
         inside: worlds in which the centre of an occupied voxel lies inside the sweep.
         n_worlds: of how many.
         distance: signed distance of the sweep to the nearest true solid, metres; the path

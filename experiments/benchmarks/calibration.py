@@ -169,7 +169,7 @@ def report(
         "space that the map cannot judge: a checker refuses those, and they are left out here. "
         f"Of the other {reported.n}, {100 * reported.mean_observed:.1f} % really collide.", "",
         "| joint probability | mean predicted | Brier | ECE |", "|---|---|---|---|",
-        "| as reported (an occupied voxel counts as the ball inscribed in it) "
+        "| as reported (surfaces between voxels) "
         f"| {reported.mean_predicted:.3f} | {reported.brier:.3f} | {reported.ece:.3f} |",
         "| voxel centres alone (an occupied voxel's centre inside the sweep) "
         f"| {defined.mean_predicted:.3f} | {defined.brier:.3f} | {defined.ece:.3f} |", "",

@@ -19,14 +19,14 @@ import vprism_plan as vp
 from vprism_plan._kernels import checking as kernels
 from vprism_plan.collision import CheckerConfig, CollisionChecker
 from vprism_plan.collision.packing import pack_robot
-from vprism_plan.collision.risk import clopper_pearson, count_path, grown, tolerated_hits
+from vprism_plan.collision.risk import BLUR, clopper_pearson, count_path, grown, tolerated_hits
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.world import Box
 
 S = 64
 H = 0.01
 RADIUS = 0.02
-CORNER = (0.5 * np.sqrt(3.0) - 0.5) * H  # from the faces of a voxel to its corners
+BLURRED = BLUR * H
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -44,14 +44,21 @@ def drawn(small):
 @pytest.fixture(scope="module")
 def free_world(small):
     """Only the draws, and the table, are obstacles."""
-    return vp.World(small, vp.WorldConfig(occluded="free"))
+    return all_drawn(vp.World(small, vp.WorldConfig(occluded="free")), S)
 
 
 @pytest.fixture(scope="module")
 def strict_world(small):
     """Hidden space without support, and a known box, are obstacles in every world."""
     known = (Box("crate", (0.04, 0.3, 0.1), at(-0.15, 0.0, 0.05)),)
-    return vp.World(small, vp.WorldConfig(known=known))
+    return all_drawn(vp.World(small, vp.WorldConfig(known=known)), 128)
+
+
+def all_drawn(world, n_worlds):
+    """The world, no voxel of whose draws is taken for certain: then they are the oracle's."""
+    drawn = vp.PosteriorWorlds(world.map, n_worlds, 7, H, reach=0.25, tolerance=0.0)
+    world._draws[n_worlds, 7] = drawn
+    return world
 
 
 def config(**changes):
@@ -111,10 +118,13 @@ def swept(checker, path):
 
 
 def steps_of(checker, path):
+    """Samples of each edge: as many as gaps need, or four times that, again and again."""
     packed = pack_robot(checker.robot.arrays)
     steps = np.empty(len(path) - 1, np.int64)
     kernels.count_steps(path, packed.floats, packed.ints, setting(checker).spacing, steps)
-    return steps
+    found = np.diff(swept(checker, path).waypoints)
+    assert np.isin(found / steps, [1, 4, 16, 64]).all()
+    return found
 
 
 def oracle_counts(checker, drawn, path, allowed=None):
@@ -462,7 +472,8 @@ def test_tolerated_hits_are_the_most_that_keep_the_bound():
 
 
 def test_no_hit_is_not_no_risk(ball):
-    estimate = ball.collision_probability([0.0, 0.0, 0.4])
+    skipping = CollisionChecker(ball.world, ball.robot, config(risk_seed=8))
+    estimate = skipping.collision_probability([0.0, 0.0, 0.4])
     assert estimate.probability == 0.0
     exact = binomtest(0, S).proportion_ci(0.95, method="exact").high
     assert exact <= estimate.upper <= exact + 1e-3
@@ -477,8 +488,8 @@ def test_bounds_hold_the_size_of_voxels_and_the_skipped_ones_errors(ball, drawn,
         estimate = ball.collision_probability(q)
         if estimate.certain:
             continue
-        corners = ball_touches(drawn, q, RADIUS + CORNER, H).sum()
-        centres = ball_touches(drawn, q, RADIUS - 0.5 * H, H).sum()
+        corners = ball_touches(drawn, q, RADIUS + BLURRED, H).sum()
+        centres = ball_touches(drawn, q, RADIUS - BLURRED, H).sum()
         assert estimate.upper == pytest.approx(min(1.0, upper[corners] + worlds.error_free))
         assert estimate.lower == pytest.approx(max(0.0, lower[centres] - worlds.error_occupied))
 
@@ -504,7 +515,7 @@ def test_intervals_hold_what_finer_voxels_find(small, ball, doubtful):
         finer = np.zeros(S, bool)
         for part in np.array_split(around, len(around) // 5000 + 1):
             finer |= (draw_owners(small, step * part, S, 7) > 0).any(axis=0)
-        bounds = [count_path(grown(setting(ball), v), path).touched > 0 for v in (-0.5, CORNER / H)]
+        bounds = [count_path(grown(setting(ball), v), path).touched > 0 for v in (-BLUR, BLUR)]
         assert estimate.lower <= finer.mean() <= estimate.upper
         missed += (finer & ~bounds[1]).sum()
         share += bounds[1].sum() - bounds[0].sum()
@@ -653,7 +664,7 @@ def test_validity_is_few_enough_worlds_nothing_certain_and_off_the_level_set(
         assert all(isinstance(checker.is_valid(q), bool) for q in Q[:20])
         np.testing.assert_array_equal(checker.is_valid_batch(Q), singles)
         np.testing.assert_array_equal([checker.is_valid_buffer(q) for q in Q], singles)
-        hits = np.array([ball_touches(drawn, q, RADIUS + CORNER, H).sum() for q in Q])
+        hits = np.array([ball_touches(drawn, q, RADIUS + BLURRED, H).sum() for q in Q])
         estimates = [checker.collision_probability(q) for q in Q]
         certain = np.array([e.certain for e in estimates])
         off = ~on_level_set(checker, Q)

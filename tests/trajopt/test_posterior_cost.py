@@ -115,7 +115,9 @@ def test_when_cold_it_is_the_share_of_draws_that_are_touched(cost_map, ball, sha
     for x in (0.03, 0.055, 0.08, 0.095):
         path = behind(x)
         low, high = (
-            np.any([ball_touches(voxels, c, r, 0.01) for c in path.numpy()], axis=0).mean()
+            np.any(
+                [ball_touches(voxels, c, r, 0.01, inscribed=True) for c in path.numpy()], axis=0
+            ).mean()
             for r in (RADIUS - 1e-4, RADIUS + 0.006)
         )
         p = float(sharp.probability(path))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Compiled loops behind planners' objectives: what a robot risks along a straight motion.
 
-Quicker and coarser than the kernels that verdicts rest on (`risk`), and never milder: an
-objective is asked about hundreds of motions where a checker is asked about one. Most of a
-motion is far from anything uncertain and is passed over in strides.
+Coarser than the kernels that verdicts rest on (`risk`), and never milder: an objective is
+asked about hundreds of motions where a checker is asked about one. Most of a motion is far from
+anything uncertain and is passed over in strides.
 
 The robot (`rf`, `ri`) is packed as in `vprism_plan._kernels.robot`, the draws' tables are those of
 `vprism_plan._kernels.risk`.
@@ -12,7 +12,7 @@ The robot (`rf`, `ri`) is packed as in `vprism_plan._kernels.robot`, the draws' 
 import numpy as np
 
 from vprism_plan._kernels.jit import njit
-from vprism_plan._kernels.risk import UNBAKED, mark_ball
+from vprism_plan._kernels.risk import mark_ball, touch_ball
 from vprism_plan._kernels.robot import fk_frames
 
 _MAX_TURN = 0.5  # radians per step, as in `checking`
@@ -70,52 +70,6 @@ def _away(gx, gy, gz, possible, corner):
 
 
 @njit(cache=True, nogil=True)
-def _bound_ball(gx, gy, gz, need, distance_row, table, rows, lowest, scale, reach, hit):
-    """Add to hit (S,) the draws that may occupy a voxel centre within `need` of g (voxels of
-    the table): 1 some may, 0 none, -1 a voxel is unbaked.
-
-    Every node v of the cell around g must allow it: some occupied centre within
-    need + |g - v| of v. What one node rules out is free; so no draw is missed.
-    """
-    _, ex, ey, ez = distance_row.shape
-    if not (0.0 <= gx <= ex - 1.0 and 0.0 <= gy <= ey - 1.0 and 0.0 <= gz <= ez - 1.0):
-        return 0
-    x0, y0, z0 = min(int(gx), ex - 2), min(int(gy), ey - 2), min(int(gz), ez - 2)
-    found = np.empty(8, np.int64)
-    limits = np.empty(8, np.uint8)
-    n = 0
-    for corner in range(8):
-        x, y, z = x0 + (corner >> 2), y0 + ((corner >> 1) & 1), z0 + (corner & 1)
-        row = distance_row[table, x, y, z]
-        if row < 0:
-            return -1 if row == UNBAKED else 0
-        away = need + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-        if away < reach:  # the table knows no farther: never "free" for that
-            limit = np.uint8(away * scale)
-            if lowest[row] > limit:
-                return 0
-            found[n] = row
-            limits[n] = limit
-            n += 1
-    if n == 8:
-        a, b, c, d = rows[found[0]], rows[found[1]], rows[found[2]], rows[found[3]]
-        e, f, g, h = rows[found[4]], rows[found[5]], rows[found[6]], rows[found[7]]
-        for s in range(hit.size):
-            hit[s] |= np.uint8(
-                (a[s] <= limits[0]) & (b[s] <= limits[1]) & (c[s] <= limits[2])
-                & (d[s] <= limits[3]) & (e[s] <= limits[4]) & (f[s] <= limits[5])
-                & (g[s] <= limits[6]) & (h[s] <= limits[7])
-            )  # fmt: skip
-    else:
-        for s in range(hit.size):
-            inside = True
-            for k in range(n):
-                inside &= rows[found[k], s] <= limits[k]
-            hit[s] |= np.uint8(inside)
-    return 1
-
-
-@njit(cache=True, nogil=True)
 def _read_field(gx, gy, gz, ball, field, corner, directions, peak):
     """Mean, or largest, value of a field at some points of a ball (voxels), 0 outside it."""
     nx, ny, nz = field.shape
@@ -147,6 +101,7 @@ def sweep_draws(
     T = np.empty((ri[0], 12))
     q = np.empty(ri[4])
     here = np.empty(n_draws, np.uint8)
+    hit, sure = np.empty(n_draws, np.uint8), np.empty(n_draws, np.uint8)
     touched[:] = 0
     counts[:] = 0
     missing = 0
@@ -172,27 +127,30 @@ def sweep_draws(
             # The bounding sphere first, then sphere by sphere.
             gx, gy, gz = _voxel(T, f, rf[bo], rf[bo + 1], rf[bo + 2], spacing)
             grown = bend + 0.5 * step
-            clear = _away(gx, gy, gz, possible, corner) - (rf[bo + 3] + grown) / spacing - 0.5
+            clear = _away(gx, gy, gz, possible, corner) - (rf[bo + 3] + grown) / spacing - 1.0
             if clear <= 2.0:
                 clear = 1e9
                 for s in range(begin, end):
                     x, y, z = rf[ri[17] + s], rf[ri[17] + ns + s], rf[ri[17] + 2 * ns + s]
                     gx, gy, gz = _voxel(T, f, x, y, z, spacing)
                     r = radii[s]
-                    need = (np.sqrt(r * r + 0.25 * step * step) + bend) / spacing + 0.5
+                    need = (np.sqrt(r * r + 0.25 * step * step) + bend) / spacing + 1.0
                     free = _away(gx, gy, gz, possible, corner) - need
                     clear = min(clear, free)
                     if free > 0.0:
                         continue
-                    found = _bound_ball(
-                        gx - first[0], gy - first[1], gz - first[2], need, distance_row,
-                        tables[s], rows, lowest, scale, reach, here,
+                    ball = need - 1.0
+                    gx, gy, gz = gx - first[0], gy - first[1], gz - first[2]
+                    found = touch_ball(
+                        gx, gy, gz, ball, tables[s], distance_row, rows, lowest, scale, reach,
+                        hit, sure,
                     )  # fmt: skip
                     if found < 0:
                         missing += 1
-                        mark_ball(
-                            gx - first[0], gy - first[1], gz - first[2], need, tables[s], wanted
-                        )
+                        mark_ball(gx, gy, gz, ball, tables[s], wanted)
+                    elif found > 0:
+                        for w in range(n_draws):
+                            here[w] |= hit[w]
             if clear <= 0.0:
                 stride = 0.0
             elif clear * spacing < stride * step:

@@ -4,12 +4,18 @@
 One draw of the weights is one possible world. All tables keep the S draws innermost,
 so that every loop over them runs on vectors. Distances are in voxels.
 
+An occupied voxel stands for the ball around its centre that reaches to the draw's surface,
+which lies between voxels: see `_depths`.
+
 Tables (see `vprism_plan.world.posterior_worlds`):
-    owner_row (nx, ny, nz) int32: -1 where every draw is free, else a row of `owners`.
+    owner_row (nx, ny, nz) int32: a row of `owners`, or -1 - q where every draw is free, at
+        log-odds of -q / ODDS.
     owners (rows, S) uint8: 0 free, k the object class that occupies the voxel in the draw.
+    odds (rows, S) int8: log-odds of being occupied, times ODDS.
     distance_row (g, ex, ey, ez) int32: row of `rows` per contact rule g; FREE beyond the
         reach of anything that any draw occupies, UNBAKED until somebody asks.
-    rows (rows, S) uint8: floor(scale * distance to the nearest occupied voxel centre), or
+    rows (rows, S) uint8: DEEP - 1 to 0 in occupied voxels, by the radius of their balls, up to
+        one voxel; else DEEP + floor(scale * distance to the nearest occupied voxel centre), or
         NOTHING beyond the reach. lowest (rows,): over the draws.
 """
 
@@ -20,13 +26,18 @@ from vprism_plan._kernels.jit import njit
 FREE = np.int32(-2)
 UNBAKED = np.int32(-1)
 NOTHING = np.uint8(255)
+DEEP = 16  # steps per voxel of the depth of an occupied one
+ODDS = 12.0  # steps of the log-odds per nat
+MOST_ODDS = 127
 BLOCK = 16  # edge of the blocks that are drawn and baked at once, voxels
+_STEP_RIM = np.float32(1e-3)  # of a step; what rounding may add to a whole number of them
 _FAR = np.uint16(40000)  # above any squared distance within reach, and twice that still fits
 
 
 @njit(cache=True, nogil=True)
-def classify(logits, n_draws, n_classes, out):
-    """Which object occupies each voxel in each draw: out (n, S), from logits (n, S * K).
+def classify(logits, n_draws, n_classes, out, odds):
+    """Which object occupies each voxel in each draw: out (n, S), from logits (n, S * K), and
+    the log-odds of that, odds (n, S).
 
     Occupied where 1 - softmax(z)_0 > 1/2, which is sum_{k >= 1} exp(z_k - z_0) > 1; by
     the likeliest object.
@@ -40,22 +51,71 @@ def classify(logits, n_draws, n_classes, out):
                 if logits[i, o + k] > logits[i, o + best]:
                     best = k
             gap = logits[i, o + best] - empty
-            occupied = gap > 0.0
-            if not occupied and n_classes > 2:
+            if n_classes > 2 and abs(gap) * ODDS < MOST_ODDS:
                 total = 0.0
                 for k in range(1, n_classes):
                     total += np.exp(logits[i, o + k] - empty)
-                occupied = total > 1.0
-            out[i, s] = best if occupied else 0
+                gap = np.log(total)
+            steps = min(max(np.rint(abs(gap) * ODDS), 1.0), MOST_ODDS)
+            out[i, s] = best if gap > 0.0 else 0
+            odds[i, s] = steps if gap > 0.0 else -steps
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _steeper(row, owner_row_value, owners, odds, counts, steepest):
+    """Raise steepest (S,) to 1 / t, where t is the way, voxels, from occupied voxel `row` to the
+    surface on the way to its neighbour; nothing if that one is occupied, too."""
+    if owner_row_value < 0:
+        other = np.float32(-1 - owner_row_value)
+        for s in range(steepest.size):
+            mine = np.float32(odds[row, s])
+            steepest[s] = max(steepest[s], (mine + other) / max(mine, np.float32(1.0)))
+    else:
+        for s in range(steepest.size):
+            mine = max(np.float32(odds[row, s]), np.float32(1.0))
+            # The surface between an object that counts and one that does not is half way.
+            other = -np.float32(odds[owner_row_value, s])
+            if owners[owner_row_value, s] != 0:
+                other = np.float32(-1e9) if counts[owners[owner_row_value, s]] else mine
+            steepest[s] = max(steepest[s], (mine + other) / mine)
 
 
 @njit(cache=True, nogil=True)
-def bake_block(owner_row, owners, counts, cx, cy, cz, reach, lut, wanted, out):
-    """Distance from every wanted voxel of a block to the nearest occupied one, per draw.
+def _depths(x, y, z, owner_row, owners, odds, counts, steepest, squares, out):
+    """Replace the entries of out (S,) in draws that occupy a voxel: DEEP - the depth in steps.
+
+    The surface crosses the axes through the voxel where the log-odds, linear between centres,
+    are 0, nearest at ways t_x, t_y, t_z; the plane through these points is 1 / sqrt(sum 1 / t^2)
+    away. Depths are rounded up, at most one voxel.
+    """
+    row = owner_row[x, y, z]
+    squares[:] = 0.0
+    for axis in range(3):
+        steepest[:] = 0.0
+        for way in (-1, 1):
+            a = x + (way if axis == 0 else 0)
+            b = y + (way if axis == 1 else 0)
+            c = z + (way if axis == 2 else 0)
+            inside = 0 <= a < owner_row.shape[0] and 0 <= b < owner_row.shape[1]
+            inside = inside and 0 <= c < owner_row.shape[2]
+            beside = owner_row[a, b, c] if inside else -1 - MOST_ODDS
+            _steeper(row, beside, owners, odds, counts, steepest)
+        for s in range(squares.size):
+            squares[s] += steepest[s] * steepest[s]
+    for s in range(squares.size):
+        if counts[owners[row, s]]:
+            steps = DEEP / np.sqrt(max(squares[s], np.float32(1.0)))
+            out[s] = np.uint8(DEEP - np.ceil(steps - _STEP_RIM))
+
+
+@njit(cache=True, nogil=True)
+def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, out):
+    """Distance from every wanted voxel of a block to the nearest occupied one, per draw, and
+    depth in occupied ones.
 
     Exact Euclidean, one pass per axis over a halo of `reach` voxels.
 
-    owner_row, owners: which draw occupies what; voxels outside the array are free.
+    owner_row, owners, odds: which draw occupies what; voxels outside the array are free.
     counts (256,): whether an object class counts as occupied.
     cx, cy, cz: first voxel of the block in `owner_row`; may lie outside.
     lut: squared distance to what is stored. wanted (B, B, B): row of `out`, or -1.
@@ -105,6 +165,7 @@ def bake_block(owner_row, owners, counts, cx, cy, cz, reach, lut, wanted, out):
                         for s in range(n_draws):
                             best[s] = min(best[s], np.uint16(column[s] + away))
     total = np.empty(n_draws, np.uint16)
+    steepest, squares = np.empty(n_draws, np.float32), np.empty(n_draws, np.float32)
     for a in range(BLOCK):
         for b in range(BLOCK):
             for k in range(BLOCK):
@@ -120,6 +181,10 @@ def bake_block(owner_row, owners, counts, cx, cy, cz, reach, lut, wanted, out):
                             total[s] = min(total[s], np.uint16(column[s] + away))
                 for s in range(n_draws):
                     out[row, s] = lut[min(total[s], lut.size - 1)]
+                x, y, z = cx + a, cy + b, cz + k
+                inside = 0 <= x < owner_row.shape[0] and 0 <= y < owner_row.shape[1]
+                if inside and 0 <= z < owner_row.shape[2] and owner_row[x, y, z] >= 0:
+                    _depths(x, y, z, owner_row, owners, odds, counts, steepest, squares, out[row])
 
 
 # What a ball may be found to touch: nothing, what `hit` says, or nobody knows yet.
@@ -131,7 +196,7 @@ _RIM = 1e-9  # voxels; a centre on the rim of a ball is in it, however it rounds
 def _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach, hit):
     """Bits of the draws that no node of the cell around a ball proves free of it.
 
-    A voxel centre x is within `need` of c only if every node v of the cell around c has
+    An occupied voxel's centre x is within `need` of c only if every node v of the cell around c has
     |v - x| <= need + |c - v|. Fills hit (S,) only if the answer is `_SOME`.
     """
     _, ex, ey, ez = distance_row.shape
@@ -145,7 +210,7 @@ def _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach
     if row < 0:
         return _UNKNOWN if row == UNBAKED else _NOTHING
     away = need + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-    if away < reach and lowest[row] > np.uint8(away * scale):
+    if away < reach and lowest[row] > np.uint8(DEEP + away * scale):
         return _NOTHING
     hit[:] = 1
     for corner in range(8):
@@ -157,7 +222,7 @@ def _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach
             return _UNKNOWN if row == UNBAKED else _NOTHING
         away = need + np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
         if away < reach:  # the table knows no farther: never "free" for that
-            limit = np.uint8(away * scale)
+            limit = np.uint8(DEEP + away * scale)
             if lowest[row] > limit:
                 return _NOTHING
             values = rows[row]
@@ -167,34 +232,35 @@ def _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _must_touch(gx, gy, gz, need, table, distance_row, rows, scale, sure):
-    """Bits of the draws that some node of the cell proves to touch: |v - x| + |c - v| <= need."""
+def _must_touch(gx, gy, gz, ball, table, distance_row, rows, scale, sure):
+    """Bits of the draws that some node of the cell proves to touch: |v - x| + |c - v| <= ball."""
     _, ex, ey, ez = distance_row.shape
     sure[:] = 0
     for corner in range(8):
         x = min(int(gx), ex - 2) + (corner >> 2)
         y = min(int(gy), ey - 2) + ((corner >> 1) & 1)
         z = min(int(gz), ez - 2) + (corner & 1)
-        left = need - np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
-        # A stored distance is rounded down by less than one step.
-        limit = min(int(left * scale) - 1, 254)
-        if limit >= 0:
+        left = ball - np.sqrt((gx - x) ** 2 + (gy - y) ** 2 + (gz - z) ** 2)
+        if left >= 0.0:
             values = rows[distance_row[table, x, y, z]]
-            bound = np.uint8(limit)
+            # A stored distance is rounded down by less than one step.
+            bound = np.uint8(min(DEEP - 1 + int(left * scale), 254))
             for s in range(sure.size):
                 sure[s] |= np.uint8(values[s] <= bound)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _look(gx, gy, gz, need, table, distance_row, rows, lowest, sure):
-    """Add to sure (S,) the draws that occupy a voxel centre in the outer shell of a ball.
+def _look(gx, gy, gz, ball, table, distance_row, rows, lowest, sure):
+    """Add to sure (S,) the draws in which an occupied voxel in the outer shell of a ball, or
+    around it, reaches into it.
 
     What lies deeper than two voxels in a ball is known from the nodes: they are less than
     0.87 voxels off its centre. Returns `_UNKNOWN` at an unbaked voxel.
     """
     _, ex, ey, ez = distance_row.shape
+    need = ball + 1.0
     outer = (need + _RIM) ** 2
-    inner = max(need - 2.0, 0.0) ** 2
+    inner = max(ball - 2.0, 0.0) ** 2
     for x in range(max(int(np.ceil(gx - need)), 0), min(int(gx + need) + 1, ex)):
         for y in range(max(int(np.ceil(gy - need)), 0), min(int(gy + need) + 1, ey)):
             flat = (gx - x) ** 2 + (gy - y) ** 2
@@ -206,32 +272,36 @@ def _look(gx, gy, gz, need, table, distance_row, rows, lowest, sure):
                     row = distance_row[table, x, y, z]
                     if row == UNBAKED:
                         return _UNKNOWN
-                    if row >= 0 and lowest[row] == 0:
+                    if row < 0:
+                        continue
+                    short = max(np.sqrt(away) - ball - _RIM, 0.0)
+                    bound = np.uint8(min(DEEP * (1.0 - short), DEEP - 1.0))
+                    if lowest[row] <= bound:
                         values = rows[row]
                         for s in range(sure.size):
-                            sure[s] |= np.uint8(values[s] == 0)
+                            sure[s] |= np.uint8(values[s] <= bound)
     return _SOME
 
 
 @njit(cache=True, nogil=True)
-def _touch_ball(
+def touch_ball(
     gx, gy, gz, ball, table, distance_row, rows, lowest, scale, reach, hit, sure
 ):  # fmt: skip
     """In which draws a ball touches something; fills hit (S,) only if the answer is `_SOME`.
 
-    gx, gy, gz: centre, in voxels of the table. ball: radius in voxels; every occupied voxel
-    counts as the ball inscribed in it, so what counts is a voxel centre within ball + 1/2.
-    Exact: what the distances at the nodes around leave open is looked up voxel by voxel.
+    gx, gy, gz: centre, in voxels of the table. ball: radius in voxels; what counts is an
+    occupied voxel's centre within ball + its depth, which is at most 1. Exact: what the
+    distances at the nodes around leave open is looked up voxel by voxel.
     """
-    need = ball + 0.5
+    need = ball + 1.0
     found = _may_touch(gx, gy, gz, need, table, distance_row, rows, lowest, scale, reach, hit)
     if found == _SOME:
-        _must_touch(gx, gy, gz, need, table, distance_row, rows, scale, sure)
+        _must_touch(gx, gy, gz, ball, table, distance_row, rows, scale, sure)
         open_draws = 0
         for s in range(hit.size):
             open_draws += hit[s] & (1 - sure[s])
         if open_draws > 0:
-            found = _look(gx, gy, gz, need, table, distance_row, rows, lowest, sure)
+            found = _look(gx, gy, gz, ball, table, distance_row, rows, lowest, sure)
             if need >= reach:
                 sure[:] = 1  # farther than the table knows: never "free"
         for s in range(hit.size):
@@ -280,7 +350,7 @@ def touch(
             gy = C[i, 1, j] / spacing - first[1]
             gz = C[i, 2, j] / spacing - first[2]
             ball = (radii[j] + slack[i, j]) / spacing
-            found = _touch_ball(
+            found = touch_ball(
                 gx, gy, gz, ball, tables[j], distance_row, rows, lowest, scale, reach, hit, sure
             )
             if found == _SOME:
@@ -317,7 +387,7 @@ def touch_one(C, radii, tables, distance_row, rows, lowest, first, spacing, scal
         gx = C[0, j] / spacing - first[0]
         gy = C[1, j] / spacing - first[1]
         gz = C[2, j] / spacing - first[2]
-        found = _touch_ball(
+        found = touch_ball(
             gx, gy, gz, radii[j] / spacing, tables[j], distance_row, rows, lowest, scale, reach,
             hit, sure,
         )  # fmt: skip
@@ -346,7 +416,7 @@ def touch_each(
         gx = centers[i, 0] / spacing - first[0]
         gy = centers[i, 1] / spacing - first[1]
         gz = centers[i, 2] / spacing - first[2]
-        found = _touch_ball(
+        found = touch_ball(
             gx, gy, gz, radii[i] / spacing, table, distance_row, rows, lowest, scale, reach,
             hit, sure,
         )  # fmt: skip
@@ -362,14 +432,14 @@ def touch_each(
 
 @njit(cache=True, nogil=True)
 def causes(
-    C, slack, radii, tables, first, spacing, first_sample, counts, owner_row, owners,
-    sphere, owner,
+    C, slack, radii, tables, distance_row, rows, first, spacing, first_sample, owner_row, owners,
+    halo, sphere, owner,
 ):  # fmt: skip
     """Which ball touched first in each draw, and whose voxel: sphere (S,), owner (S,).
 
-    Of the balls at the draw's first sample, the one that reaches deepest into the occupied
-    voxel nearest to it. counts (g, 256): the classes that count under each table. first (3,)
-    is the first voxel of the owners. -1 and 0 where no draw touches. All must be drawn.
+    Of the balls at the draw's first sample, the one that reaches deepest into an occupied
+    voxel. first (3,) is the first voxel of the tables, `halo` voxels before that of the owners.
+    -1 and 0 where no draw touches. All must be baked.
     """
     nx, ny, nz = owner_row.shape
     deepest = np.full(owners.shape[1], -np.inf)
@@ -382,11 +452,11 @@ def causes(
         for j in range(C.shape[2]):
             if tables[j] < 0:
                 continue
-            x = C[i, 0, j] / spacing - first[0]
-            y = C[i, 1, j] / spacing - first[1]
-            z = C[i, 2, j] / spacing - first[2]
-            ball = (radii[j] + slack[i, j]) / spacing + 0.5 + _RIM
-            wide = ball
+            x = C[i, 0, j] / spacing - first[0] - halo
+            y = C[i, 1, j] / spacing - first[1] - halo
+            z = C[i, 2, j] / spacing - first[2] - halo
+            ball = (radii[j] + slack[i, j]) / spacing + 2.0 * _RIM
+            wide = ball + 1.0
             for a in range(max(int(x - wide), 0), min(int(x + wide) + 2, nx)):
                 for b in range(max(int(y - wide), 0), min(int(y + wide) + 2, ny)):
                     flat = (a - x) ** 2 + (b - y) ** 2
@@ -396,11 +466,13 @@ def causes(
                         row = owner_row[a, b, c]
                         if row < 0:
                             continue
-                        depth = ball - np.sqrt(flat + (c - z) ** 2)
-                        if depth < 0.0:
+                        into = ball - np.sqrt(flat + (c - z) ** 2)
+                        if into < -1.0:
                             continue
+                        values = rows[distance_row[tables[j], a + halo, b + halo, c + halo]]
                         for s in mine:
-                            if depth > deepest[s] and counts[tables[j], owners[row, s]]:
+                            depth = into + (DEEP - values[s]) / DEEP
+                            if values[s] < DEEP and depth >= 0.0 and depth > deepest[s]:
                                 deepest[s] = depth
                                 sphere[s] = j
                                 owner[s] = owners[row, s]

@@ -36,13 +36,14 @@ _MAX_SAMPLES = 64
 _SLAB = 8  # planes of nodes classified at once
 # Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
 PADDINGS = (0.5, 1.0, 2.0)
-# Voxels between a voxel's faces and its corners: a sphere grown by it touches the ball around
-# every occupied voxel that it meets, where else it touches the ball inside.
-CORNER = 0.5 * 3.0**0.5 - 0.5
+# Voxels by which a draw's surface may lie off where its voxels put it.
+BLUR = 0.25
 # Voxels between a sphere's surface and the farthest voxel it is compared with: the way to
-# the far node of its centre's cell, half a diagonal for a voxel's own size, at most five
-# eighths for the way between samples, and room to spare.
-_ROOM = 3.0 + CORNER
+# the far node of its centre's cell, the deepest that a voxel's centre lies in an object, at most
+# five eighths for the way between samples, and room to spare.
+_ROOM = 3.5 + BLUR
+_FINER, _REFINEMENTS = 4, 3  # samples of an edge, each time; its spheres grow by a 16th
+_UNDECIDED = 0.01  # share of worlds that only the way between samples touches
 
 
 class Certain:
@@ -139,8 +140,13 @@ class Sweep:
     first: Int[np.ndarray, " w"]  # sample of the first touch, -1 if none
 
 
-def count_path(at: Setting, path: Waypoints) -> Sweep:
-    """Sample a path without gaps and count the worlds that it touches."""
+def count_path(at: Setting, path: Waypoints, enough: int = 0) -> Sweep:
+    """Sample a path without gaps and count the worlds that it touches.
+
+    Spheres grow by what covers the way to the next sample, which counts worlds whose surfaces
+    they pass. While that makes a difference, edges that touch anything are sampled finer; not
+    where no more than `enough` worlds are touched.
+    """
     if len(path) == 1:
         centers, hits = count_at(at, path[0])
         if hits:
@@ -149,7 +155,25 @@ def count_path(at: Setting, path: Waypoints) -> Sweep:
         slack, touched = np.zeros((1, len(at.radii))), np.zeros(n, np.uint8)
         return Sweep(centers[None], slack, none, touched, none, np.full(n, -1))
     steps = np.empty(len(path) - 1, np.int64)
-    n = int(checking.count_steps(path, at.floats, at.ints, at.spacing, steps)) + 1
+    checking.count_steps(path, at.floats, at.ints, at.spacing, steps)
+    sweep = _swept(at, path, steps)
+    for _ in range(_REFINEMENTS):
+        passed = sweep.touched.sum()
+        if passed <= enough or passed - recount(at, sweep, within=True).touched.sum() <= (
+            _UNDECIDED * at.worlds.n_worlds
+        ):
+            break
+        touching = np.add.reduceat(sweep.counts, sweep.waypoints[:-1])
+        touching += sweep.counts[sweep.waypoints[1:]]
+        steps = np.where(touching > 0, _FINER * steps, steps)
+        if steps.sum() >= AT_MOST:
+            break
+        sweep = _swept(at, path, steps)
+    return sweep
+
+
+def _swept(at: Setting, path: Waypoints, steps: Int[np.ndarray, " e"]) -> Sweep:
+    n = int(steps.sum()) + 1
     if n > AT_MOST:
         raise RobotError(
             f"a path of {len(path)} waypoints needs {n:,} configurations to miss nothing on the "
@@ -239,10 +263,12 @@ def _touching(
 ) -> Counter[tuple[int, str, int]]:
     """Count (sphere, body, sample) of the first touch over the worlds."""
     sphere, owner = np.empty((2, len(first)), np.int64)
-    rows, owners, origin = at.worlds.owner_tables
+    worlds = at.worlds
+    rows, owners, _ = worlds.owner_tables
+    tables = worlds.tables
     risk.causes(
-        sweep.centers, sweep.slack, at.radii, at.sphere_tables, origin, at.worlds.resolution,
-        first, at.worlds.counting(), rows, owners, sphere, owner,
+        sweep.centers, sweep.slack, at.radii, at.sphere_tables, tables.distance_row, tables.rows,
+        worlds.first, worlds.resolution, first, rows, owners, worlds.halo, sphere, owner,
     )  # fmt: skip
     ids = at.world.map.object_ids
     return Counter(
@@ -273,12 +299,12 @@ class PathRisk:
     how many may collide with what is valid, under `config.max_risk`."""
 
     def __init__(self, setting: Setting) -> None:
-        # Probabilities are of touching; verdicts keep the margin as well, and touch a voxel
-        # at its corners.
+        # Probabilities are of touching; verdicts keep the margin as well, and know no surface
+        # better than `BLUR`.
         self.setting, config, rules = setting, setting.config, setting.certain.rules
-        self._corners = grown(setting, CORNER)
+        self._blurred = grown(setting, BLUR)
         kept = replace(setting, radii=setting.radii + config.margin, margin=config.margin)
-        self._kept = grown(kept, CORNER)
+        self._kept = grown(kept, BLUR)
         worlds = setting.worlds
         lower, upper = clopper_pearson(config.n_worlds, config.confidence)
         self._lower = np.maximum(lower - worlds.error_occupied, 0.0)
@@ -310,14 +336,14 @@ class PathRisk:
             other = copy.copy(self)
             worlds = self.setting.worlds
             other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
-            other._corners = grown(other.setting, CORNER)
+            other._blurred = grown(other.setting, BLUR)
             self._held_out = other
         return self._held_out
 
     def accepts(self, path: Waypoints) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
         obstacles aside."""
-        return bool(count_path(self._kept, path).touched.sum() <= self.allowed)
+        return bool(count_path(self._kept, path, self.allowed).touched.sum() <= self.allowed)
 
     def accepts_one(self, q: Configuration) -> bool:
         """Return `accepts` of one configuration: the quick way."""
@@ -329,7 +355,7 @@ class PathRisk:
 
     def exceeded_at(self, edge: Float[np.ndarray, "2 dof"]) -> float:
         """Return where along an edge, 0 to 1, more worlds have collided than are allowed."""
-        sweep = count_path(self._kept, edge)
+        sweep = count_path(self._kept, edge, self.allowed)
         first = np.sort(sweep.first[sweep.first >= 0])
         return float(first[self.allowed]) / max(1, len(sweep.counts) - 1)
 
@@ -356,14 +382,15 @@ class PathRisk:
     def estimate(self, path: Waypoints, with_margin: bool = False) -> RiskEstimate:
         """Return the joint probability of collision along a path, or of coming within the
         margin; of a configuration, where the path has one row."""
-        at = grown(self._kept, -CORNER) if with_margin else self.setting
+        at = grown(self._kept, -BLUR) if with_margin else self.setting
         path = path.copy()
         n, inside = at.worlds.n_worlds, 0
-        around = sweep = count_path(self._kept if with_margin else self._corners, path)
+        blurred = self._kept if with_margin else self._blurred
+        around = sweep = count_path(blurred, path, n)
         if around.touched.any():
-            sweep = recount(at, around)
-            # A draw that occupies the centre of a voxel occupies that point, whatever voxels are.
-            inside = int(recount(grown(at, -0.5), around, within=True).touched.sum())
+            sweep = count_path(at, path)
+            around = recount(blurred, sweep)
+            inside = int(recount(grown(at, -BLUR), sweep, within=True).touched.sum())
         clear = np.empty(len(path), np.bool_)
         checking.is_valid_batch(path, at.floats, at.ints, *at.packed, clear)
         stats = np.zeros(4)

@@ -38,7 +38,7 @@ _ROOM = 3.0  # voxels between a sphere and the reach of the draws; see `Posterio
 class _DrawField:
     """Signed distance to the union of a draw's voxels and what is certain, for every draw.
 
-    A voxel that a draw occupies counts as the ball inscribed in it, as in `PosteriorWorlds`.
+    A voxel that a draw occupies counts as the ball inscribed in it: coarser than `PosteriorWorlds`.
     The nodes cover all that is nearer than `reach` to any voxel that any draw may occupy.
     Distances are cut off so far beyond it that the spline is itself up to there.
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int, Int32, UInt8
+from jaxtyping import Bool, Int, Int8, Int32, UInt8
 from scipy import ndimage
-from scipy.special import ndtr
+from scipy.special import logsumexp, ndtr
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._kernels import risk as kernels
@@ -42,22 +42,24 @@ class PosteriorWorlds:
     of the mesh, and belongs to the object of the largest logit. The same draw holds everywhere, so
     what hides in one place is correlated with what hides next to it.
 
-    Per voxel and draw one byte holds the distance to the nearest occupied voxel centre, rounded
-    down, and is compared with a ball at the nodes of the cell around its centre; what they leave
-    open is looked up voxel by voxel. An occupied voxel counts as the ball inscribed in it: a draw
-    is touched if the centre of one is within radius + resolution / 2 of a ball's centre.
+    The surface of a draw lies between voxels, where its log-odds, linear between centres, are 0.
+    An occupied voxel stands for the ball around its centre that reaches to the surface (at most a
+    voxel wide, rounded up to a sixteenth of one): a draw is touched if such a ball meets the one
+    that is asked about. Per voxel and draw one byte holds that depth, or the distance to the
+    nearest occupied voxel centre, rounded down; it is compared with a ball at the nodes of the
+    cell around its centre; what they leave open is looked up voxel by voxel.
 
     Nothing is baked before somebody asks: a block of 16^3 voxels is drawn and baked when the first
     ball lies in it (`bake` does it ahead). Memory: 4 bytes per voxel of the map's support grown by
-    `reach`, S bytes per drawn voxel and S bytes per baked voxel within `reach` of anything that any
-    draw may occupy.
+    `reach`, 2 S bytes per drawn voxel and S bytes per baked voxel within `reach` of anything that
+    any draw may occupy.
 
     Args:
         map: a `VPrismMap`.
         n_worlds: number of draws S, a multiple of 64.
         seed: of the draws; the same seed, the same worlds.
         resolution: edge of a voxel, metres; centres are whole multiples of it.
-        reach: distances up to this are known, metres: two and a half voxels more than the largest
+        reach: distances up to this are known, metres: three voxels more than the largest
             ball that will be asked about. At most 31 voxels.
         tolerance: how probable it may be that skipping the draws of nearly certain voxels changes
             any answer.
@@ -104,9 +106,10 @@ class PosteriorWorlds:
 
         self._reach = reach / self.resolution  # voxels
         self._whole = int(self._reach)
-        self.scale = min(_FINEST, 254.0 / self._reach), self._reach
+        self.scale = min(_FINEST, (254.0 - kernels.DEEP) / self._reach), self._reach
         squares = np.arange(3 * self._whole**2 + 2, dtype=np.float64)
-        self._lut = np.floor(self.scale[0] * np.sqrt(squares)).clip(max=254).astype(np.uint8)
+        steps = kernels.DEEP + np.floor(self.scale[0] * np.sqrt(squares))
+        self._lut = steps.clip(max=254).astype(np.uint8)
         self._lut[squares > self._reach**2] = kernels.NOTHING
         self._grown = self._grow()
         self.first = self._owners.first - self._whole
@@ -175,8 +178,8 @@ class PosteriorWorlds:
         self, centers: Points, radii: Any, without: Collection[int] = ()
     ) -> Bool[np.ndarray, "n s"]:
         """Return in which draws each ball (centres in the world, one radius or each its own,
-        metres) touches an occupied voxel; objects `without` may be touched. Never misses a voxel
-        centre inside a ball.
+        metres) touches an object; objects `without` may be touched. Never misses a voxel centre
+        inside a ball.
 
         The probability that a body swept along a path touches anything is
         `touched(...).any(axis=0).mean()`.
@@ -217,7 +220,8 @@ class PosteriorWorlds:
 
     @property
     def owner_tables(self) -> tuple[Any, Any, Any]:
-        """Rows of the owners per voxel, the owners (S innermost), and the first voxel."""
+        """Rows of the owners per voxel (below 0: free), the owners (S innermost), and the first
+        voxel, which is that of the tables and a halo."""
         return self._owners.row, self._owners.table, self._owners.first
 
     def baked(self) -> tuple[Any, ...]:
@@ -247,6 +251,11 @@ class PosteriorWorlds:
                 self._rules = [*self._rules, gone]
             return self._rules.index(gone)
 
+    @property
+    def halo(self) -> int:
+        """Voxels by which the tables begin before the owners."""
+        return self._whole
+
     def counting(self) -> Bool[np.ndarray, "g 256"]:
         """Return which object classes count as occupied under each rule."""
         counts = np.ones((len(self._rules), 256), np.bool_)
@@ -260,10 +269,10 @@ class PosteriorWorlds:
         largest = float(np.max(radii, initial=0.0))
         if not (np.isfinite(radii).all() and np.min(radii, initial=0.0) >= 0.0):
             raise WorldError("radii must be finite and at least 0 metres")
-        if largest / self.resolution + 2.2321 >= self._reach:
+        if largest / self.resolution + 2.7321 >= self._reach:
             raise WorldError(
                 f"a ball of radius {largest} m is beyond reach={self.reach} m; build the worlds "
-                f"with reach of at least {largest + 2.5 * self.resolution:.3f} m"
+                f"with reach of at least {largest + 3.0 * self.resolution:.3f} m"
             )
 
     def _grow(self) -> Int32[np.ndarray, "ex ey ez"]:
@@ -305,7 +314,7 @@ class PosteriorWorlds:
             def work(piece: slice) -> None:
                 for corner, rows in zip(corners[piece].tolist(), wanted[piece], strict=True):
                     kernels.bake_block(
-                        self._owners.row, self._owners.table, counts, *corner,
+                        self._owners.row, self._owners.table, self._owners.odds, counts, *corner,
                         self._whole, self._lut, rows, fresh,
                     )  # fmt: skip
 
@@ -357,7 +366,7 @@ def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
     lower, upper = (np.asarray(corner) for corner in map_.support_bounds())
     n_objects = len(map_.object_ids)
     if n_objects == 0 or not np.isfinite(lower).all() or not (lower < upper).all():
-        nothing = np.full((1, 1, 1), -1, np.int32)
+        nothing = np.full((1, 1, 1), -1 - kernels.MOST_ODDS, np.int32)
         return Verdicts(np.zeros(3, np.int64), nothing, np.zeros((0, 3), np.int64), 0.0, 0.0)
     first = np.ceil(lower / resolution).astype(np.int64)
     shape = np.floor(upper / resolution).astype(np.int64) - first + 1
@@ -366,10 +375,10 @@ def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
             f"the map's support spans {' x '.join(map(str, shape))} voxels of {resolution} m "
             f"(at most {_MAX_VOXELS:,}); use a coarser resolution"
         )
-    occupied, lost, owner = _tails(map_, first, shape, resolution)
+    occupied, lost, owner, odds = _tails(map_, first, shape, resolution)
     free = _skippable(occupied, 0.5 * tolerance)
     certain = _skippable(lost, 0.5 * tolerance) & ~free
-    row = np.full(len(free), -1, np.int32)
+    row = -1 - odds.astype(np.int32)
     row[certain] = owner[certain] - 1
     drawn = np.flatnonzero(~free & ~certain)
     row[drawn] = n_objects + np.arange(len(drawn), dtype=np.int32)
@@ -380,10 +389,12 @@ def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
 
 def _tails(
     map_: Any, first: Index, shape: Index, resolution: float
-) -> tuple[Values, Values, UInt8[np.ndarray, " n"]]:
-    """Bounds on P(occupied) and P(not the likeliest object's) of each voxel, and that object."""
+) -> tuple[Values, Values, UInt8[np.ndarray, " n"], UInt8[np.ndarray, " n"]]:
+    """Bounds on P(occupied) and P(not the likeliest object's) of each voxel, that object, and
+    the log-odds of being empty that nearly all draws exceed, in the kernels' steps."""
     n = int(np.prod(shape))
-    occupied, lost, owner = np.empty(n), np.empty(n), np.empty(n, np.uint8)
+    occupied, lost = np.empty(n), np.empty(n)
+    owner, odds = np.empty(n, np.uint8), np.empty(n, np.uint8)
     n_objects = len(map_.object_ids)
     slab = int(shape[1] * shape[2])
     step = max(1, 200_000 // slab)
@@ -402,7 +413,9 @@ def _tails(
         others[rows, best] = 0.0
         lost[piece] = ndtr(-gap[rows, best] / spread[rows, best]) + others.sum(axis=1)
         owner[piece] = best + 1
-    return occupied, lost, owner
+        steps = np.floor(-kernels.ODDS * (logsumexp(gap, axis=1) + 2.0 * spread[rows, best]))
+        odds[piece] = steps.clip(1, kernels.MOST_ODDS)
+    return occupied, lost, owner, odds
 
 
 def _skippable(bound: Values, budget: float) -> Chosen:
@@ -419,10 +432,12 @@ class Owners:
 
     Attributes:
         first: index of voxel (0, 0, 0): the centre of voxel i is resolution * (first + i).
-        row: (nx, ny, nz) int32: -1 free in every draw, else a row of `table`.
+        row: (nx, ny, nz) int32: a row of `table`, or -1 - q: free in every draw, at
+            log-odds of -q / ODDS in nearly all.
         voxels: (n, 3) those that have to be drawn, in the order of their rows.
         table: (r, S) uint8: one row per object, then one per voxel: 0 free, k the object
             `map.object_ids[k - 1]`; not filled before its block is drawn.
+        odds: (r, S) int8: log-odds of being occupied, times ODDS.
     """
 
     def __init__(
@@ -435,6 +450,8 @@ class Owners:
         n_objects = len(map_.object_ids)
         self.table = np.empty((n_objects + len(self.voxels), n_worlds), np.uint8)
         self.table[:n_objects] = np.arange(1, n_objects + 1, dtype=np.uint8)[:, None]
+        self.odds = np.empty(self.table.shape, np.int8)
+        self.odds[:n_objects] = kernels.MOST_ODDS
         self._shape = tuple(-(-n // BLOCK) for n in self.row.shape)
         key = self.block_of(self.voxels)
         self._by_block = np.argsort(key, kind="stable").astype(np.int64)
@@ -446,20 +463,22 @@ class Owners:
         """Return the owners in as many other draws, none of them drawn yet."""
         other = copy.copy(self)
         other._seed, other._weights = seed, None
-        other.table = self.table.copy()
+        other.table, other.odds = self.table.copy(), self.odds.copy()
         other._drawn = np.diff(self._block_start) == 0
         return other
 
     def snapshot(self) -> "Owners":
         """Return the same with tables of their own, which `draw` here does not change."""
         other = copy.copy(self)
-        other.table, other._drawn = self.table.copy(), self._drawn.copy()
+        other.table, other.odds = self.table.copy(), self.odds.copy()
+        other._drawn = self._drawn.copy()
         return other
 
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return sum(int(p.nbytes) for p in (self.row, self.table, self.voxels, self._by_block))
+        parts = self.row, self.table, self.odds, self.voxels, self._by_block
+        return sum(int(p.nbytes) for p in parts)
 
     def rows_of(self, local: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
         """Return the row of `table` of each voxel, -1 for free ones and outside the support."""
@@ -500,15 +519,19 @@ class Owners:
             members = self._by_block[piece]
             points = self._resolution * (self.voxels[members] + self.first)
             found = np.empty((len(members), self._n_worlds), np.uint8)
+            odds = np.empty(found.shape, np.int8)
             for start in range(0, len(points), _GEMM_ROWS):
                 rows = slice(start, start + _GEMM_ROWS)
-                self._classify(points[rows], found[rows])
+                self._classify(points[rows], found[rows], odds[rows])
             self.table[first_row + members] = found
+            self.odds[first_row + members] = odds
             self._drawn[block] = True
 
-    def _classify(self, points: Points, out: UInt8[np.ndarray, "n s"]) -> None:
-        """Fill in the class that occupies each point (m) in each draw; 0 is none. O(points x hinges
-        near any x S x K): points should be near each other."""
+    def _classify(
+        self, points: Points, out: UInt8[np.ndarray, "n s"], odds: Int8[np.ndarray, "n s"]
+    ) -> None:
+        """Fill in the class that occupies each point (m) in each draw, 0 is none, and the log-odds.
+        O(points x hinges near any x S x K): points should be near each other."""
         space, weights = self._map.space, self.sample()
         low, high = points.min(axis=0) - space.radius, points.max(axis=0) + space.radius
         near = np.flatnonzero(((space.hinges > low) & (space.hinges < high)).all(axis=1))
@@ -517,4 +540,4 @@ class Owners:
         logits = phi @ weights[near] + weights[-1]
         if self._map.prior is not None:
             logits += np.tile(self._map.prior.at(points), self._n_worlds)
-        kernels.classify(logits, self._n_worlds, weights.shape[1] // self._n_worlds, out)
+        kernels.classify(logits, self._n_worlds, weights.shape[1] // self._n_worlds, out, odds)
