@@ -218,8 +218,9 @@ def test_reasons_of_a_ball_among_everything_are_confirmed(demo_map, furnished, o
     assert set(kinds) >= {"object", "known", "unobserved", "occluded", "support"}, kinds
 
 
-def test_reasons_of_a_ball_near_clutter_are_confirmed(demo_map, demo_world, oracle, ball_robot):
-    checker = vp.CollisionChecker(demo_world, ball_robot(0.015))
+def test_reasons_of_a_ball_near_clutter_are_confirmed(demo_map, oracle, ball_robot):
+    everything = vp.World(demo_map, vp.WorldConfig(lone_share=0.0))
+    checker = vp.CollisionChecker(everything, ball_robot(0.015))
     rng = np.random.default_rng(2)
     points, eye = oracle.clutter.data, demo_map.views[0].camera_center
 

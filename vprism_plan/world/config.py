@@ -212,9 +212,10 @@ class WorldConfig:
         background_height: unlabelled points at least this far above the support plane (or three
             standard deviations, if that is more) are obstacles ...
         lone_share: ... unless they are flying pixels: alone, with points around them that fill less
-            than this share of what a surface facing the camera would show in the 3 cm around. 0
-            (default) keeps every point. 0.03 drops what a noisy camera strews behind outlines, and
-            nothing as thick as a 1 mm rod.
+            than this share of what a surface facing the camera would show in the 3 cm around. None
+            (default): 0.03, and only of points at an outline, between a nearer and a farther return.
+            0 keeps every point. 0.03 drops all that a noisy camera strews, and nothing as thick as a
+            1 mm rod.
 
     Raises:
         ConfigError: a value outside its range.
@@ -230,7 +231,7 @@ class WorldConfig:
     min_support: float = 0.5
     occlusion_tolerance: float = 0.01
     background_height: float = 0.015
-    lone_share: float = 0.0
+    lone_share: float | None = None
 
     def __post_init__(self) -> None:
         number("resolution", self.resolution, 1e-4, 1.0, "metres")
@@ -238,7 +239,8 @@ class WorldConfig:
         number("min_support", self.min_support, 0.0, unit="kernel mass")
         number("occlusion_tolerance", self.occlusion_tolerance, 0.0, 1.0, "metres")
         number("background_height", self.background_height, 0.0, 1.0, "metres")
-        number("lone_share", self.lone_share, 0.0, 0.25, "(a share)")
+        if self.lone_share is not None:
+            number("lone_share", self.lone_share, 0.0, 0.25, "(a share)")
         choice("occluded", self.occluded, get_args(OccludedPolicy))
         choice("unobserved", self.unobserved, get_args(UnobservedPolicy))
         choice("support", self.support, get_args(SupportExtent))

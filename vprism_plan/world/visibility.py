@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 
 from vprism_plan._kernels import world as kernels
@@ -61,6 +62,8 @@ _OF_POINT = np.array([SEEN, OCCLUDED, OCCLUDED, UNOBSERVED], dtype=np.uint8)
 _BLOCK = 8
 # Metres above the support plane: what is no higher hides nothing.
 THIN = 0.003
+_LONE = 0.03  # see `WorldConfig.lone_share`
+_STEP = 0.01  # metres nearer, and farther, beside a flying pixel
 
 
 @dataclass(frozen=True)
@@ -277,21 +280,31 @@ def beside(points: Points, dense: Chosen) -> Chosen:
     return np.asarray(np.isfinite(gap))
 
 
+def _at_step(view: Observation) -> Bool[np.ndarray, "h w"]:
+    """Which pixels have, within two pixels, both a nearer and a farther return."""
+    depth = np.asarray(view.depth, dtype=np.float64)
+    near = minimum_filter(np.where(depth > 0, depth, np.inf), 5)
+    far = maximum_filter(depth, 5)
+    return (near < depth - _STEP) & (far > depth + _STEP)
+
+
 def clutter_pixels(
     view: Observation,
     plane: Plane | None,
     height: float,
-    lone_share: float = 0.0,
+    lone_share: float | None = None,
     bounded: bool = False,
 ) -> Bool[np.ndarray, "h w"]:
     """Which pixels show unlabelled things off the support plane.
 
     "Off" is `height` metres, or three standard deviations of the depth noise along the normal, if
     that is more; below the plane as well if the support is `bounded`. Without a plane every
-    unlabelled pixel is. Pixels of the robot are not clutter, nor, if `lone_share` is above 0, are
-    points that with all others off the plane fill less than that share of what a surface facing the
-    camera would show in the 3 cm around them: flying pixels. A rod 1 mm thick fills 3 percent. What
-    lies within 1.5 cm of a point that is none stays: tips and edges lack half their surroundings.
+    unlabelled pixel is. Pixels of the robot are not clutter, nor are points that with all others
+    off the plane fill less than `lone_share` of what a surface facing the camera would show in the
+    3 cm around them: flying pixels. A rod 1 mm thick fills 3 percent. What lies within 1.5 cm of a
+    point that is none stays: tips and edges lack half their surroundings. None: 3 percent, and only
+    of points between a nearer and a farther one, two pixels away at most: there such pixels come
+    from, while a wire's have nothing nearer beside them.
     """
     points, labels = view.points()
     valid = view.depth > 0
@@ -303,11 +316,14 @@ def clutter_pixels(
         away = plane.signed_distance(points)
         off = (np.abs(away) if bounded else away) > threshold
         chosen &= off
-        if lone_share > 0.0:
+        share = _LONE if lone_share is None else lone_share
+        if share > 0.0:
             focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
             whole = (BLOCK * focal / depth[off]) ** 2
-            dense = points_around(points[off]) >= lone_share * whole
-            chosen[off] &= beside(points[off], dense)
+            dense = beside(points[off], points_around(points[off]) >= share * whole)
+            if lone_share is None:
+                dense |= ~_at_step(view)[valid][off]
+            chosen[off] &= dense
     found = np.zeros(view.shape, dtype=bool)
     found[valid] = chosen
     return found
@@ -317,7 +333,7 @@ def background_points(
     views: Sequence[Observation],
     plane: Plane | None,
     height: float,
-    lone_share: float = 0.0,
+    lone_share: float | None = None,
     bounded: bool = False,
 ) -> tuple[Points, Values]:
     """Points of the `clutter_pixels`, and half the width of their pixels, metres."""
