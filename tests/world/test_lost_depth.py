@@ -105,7 +105,7 @@ def test_a_hole_in_an_object_begins_at_its_surface():
 
 
 def test_frayed_outlines_and_small_holes_have_no_cone():
-    """They stood as spears behind every outline: of 80 hand poses that were free 43 were refused."""
+    """They stood as spears behind every outline: 43 of 80 free hand poses were refused."""
     view = picture([around((0.0, 0.0, 0.1), (0.1, 0.1, 0.2))])
     mask = view.labels == 1
     inside = ndimage.distance_transform_edt(mask)

@@ -213,9 +213,9 @@ class WorldConfig:
             standard deviations, if that is more) are obstacles ...
         lone_share: ... unless they are flying pixels: alone, with points around them that fill less
             than this share of what a surface facing the camera would show in the 3 cm around. None
-            (default): 0.03, and only of points at an outline, between a nearer and a farther return.
-            0 keeps every point. 0.03 drops all that a noisy camera strews, and nothing as thick as a
-            1 mm rod.
+            (default): 0.03, only of points at an outline, between a nearer and a farther return. 0
+            keeps every point. 0.03 drops all that a noisy camera strews, and nothing as thick as
+            a 1 mm rod.
 
     Raises:
         ConfigError: a value outside its range.
