@@ -23,7 +23,7 @@ from vprism_plan.perception.camera import height_sigma, inlier_band, pixel_rays
 from vprism_plan.perception.plane import TableRegion, table_region
 from vprism_plan.world.distance import bounding, lower_bounds
 from vprism_plan.world.grid import Chosen, Grid, Image, Mask, Nodes, Points, Values, Vector
-from vprism_plan.world.visibility import THIN, beside
+from vprism_plan.world.visibility import FRAY, THIN, beside, without_fringe
 
 _STRAY_SHARE = 0.03  # as in the default map: fewer neighbours than this is a flying pixel
 _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point may be free
@@ -68,7 +68,6 @@ _TALLEST = 0.4  # metres above the support surface; what stands on a table is ra
 _OVERHANG = (0.03, 0.15)  # metres by which a thing may lean out over its foot, least and most
 _SLOPE = 2.0  # metres nearer per metre to the side: how steeply a seen surface may go on
 _NEAR = 0.002  # metres a surface may bulge beside what was seen of it
-_FRAY = 2  # pixels; losses that reach no farther from an object's own returns are no news
 _BESIDE = 3  # pixels around a mask that count as beside it
 _PIECE = 200_000  # points at a time
 
@@ -110,13 +109,10 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     found: list[Cone] = []
     for object_id in lost_objects(view):
         whole = view.labels == object_id
-        window = bounding(whole, _FRAY)
+        window = bounding(whole, FRAY)
         mask, depth = whole[window], view.depth[window].astype(np.float64)
         lost = mask & (depth == 0)
-        if (mask & ~lost).any():
-            deep = ndimage.distance_transform_edt(~(mask & ~lost)) > _FRAY
-            around = np.ones((3, 3), dtype=bool)
-            lost &= ndimage.binary_dilation(lost & deep, around, iterations=_FRAY)
+        lost = without_fringe(lost, mask & ~lost)
         if not lost.any():
             continue
         rays = pixel_rays(view.shape, view.intrinsics)[window] @ view.pose[:3, :3].T

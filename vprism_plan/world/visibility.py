@@ -11,7 +11,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import (
+    binary_dilation,
+    distance_transform_edt,
+    maximum_filter,
+    minimum_filter,
+)
 from scipy.spatial import cKDTree
 
 from vprism_plan._kernels import world as kernels
@@ -20,7 +25,7 @@ from vprism_plan.mapping.training_data import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points, within_balls
 from vprism_plan.world.config import WorldConfig
-from vprism_plan.world.grid import Balls, Chosen, Image, Points, Values, Vector, window
+from vprism_plan.world.grid import Balls, Chosen, Image, Mask, Points, Values, Vector, window
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
 _NEAR = 0.1
@@ -346,8 +351,24 @@ def background_points(
     return np.concatenate(kept), np.concatenate(widths)
 
 
+FRAY = 2  # pixels by which masks and depth images are frayed along every outline
+
+
+def without_fringe(found: Mask, beside: Mask) -> Mask:
+    """Leave out found pixels that reach no farther than `FRAY` from others: a fringe of these."""
+    if not beside.any():
+        return found
+    deep = found & (distance_transform_edt(~beside) > FRAY)
+    return found & binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=FRAY)
+
+
 def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
-    """Depth (metres) from which unlabelled clutter hides what is behind it, inf elsewhere."""
+    """Depth (metres) from which unlabelled clutter hides what is behind it, inf elsewhere.
+
+    A fringe that a mask left out hides what its object hides.
+    """
     bounded = config.support == "seen"
     chosen = clutter_pixels(view, plane, config.background_height, config.lone_share, bounded)
+    if view.labels is not None:
+        chosen = without_fringe(chosen, view.labels > 0)
     return np.where(chosen, np.asarray(view.depth, dtype=np.float64), np.inf)
