@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from experiments.prior.data import Examples, data_files, write
-from experiments.prior.training import train
+from experiments.prior.training import RATE, train
 from experiments.tables.scoring import commit
 from vprism_plan.mapping.shape_network import ShapeNetwork, ShapePrior
 
@@ -52,6 +52,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=Path("build/prior"))
     parser.add_argument("--steps", type=int, default=9000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rate", type=float, default=RATE)
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--output", type=Path, default=WEIGHTS)
     chosen = parser.parse_args()
@@ -71,6 +72,7 @@ def main() -> int:
         lambda line: print(line, flush=True),  # noqa: T201
         lambda found: save_network(found, chosen.data / "latest.safetensors", origin),
         None if chosen.start is None else ShapePrior(chosen.start).network,
+        chosen.rate,
     )
     making.get()
     makers.close()

@@ -19,7 +19,7 @@ from experiments.prior.data import Examples
 from vprism_plan.mapping.shape_network import ShapeNetwork
 
 BATCH = 8
-_RATE, _DECAY = 3e-3, 1e-2
+RATE, _DECAY = 3e-3, 1e-2
 _WARM_UP = 200  # steps
 _AVERAGE = 0.998  # of the moving average
 _EVERY = 250  # steps between two looks
@@ -74,17 +74,17 @@ def train(
     log: Callable[[str], None],
     keep: Callable[[ShapeNetwork], None],
     start: ShapeNetwork | None = None,
+    rate: float = RATE,
 ) -> ShapeNetwork:
     """Return the averaged network after `steps` batches; calls `keep` with it now and then.
 
-    From random weights, or from those of `start`, then at two thirds of the rate.
+    From random weights, or from those of `start`. `rate` is the largest step of the optimizer.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     network = _fast(ShapeNetwork())
     if start is not None:
         network.load_state_dict(start.state_dict())
-    rate = _RATE if start is None else 2.0 / 3.0 * _RATE
     average = _fast(ShapeNetwork())
     average.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=_DECAY)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """A guess of the hidden side: on a grid, joined to the kernels, and overruled by what was seen."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
@@ -296,3 +298,36 @@ def test_a_guess_stays_within_its_bounds_in_every_cube(field, seed, half):
         logits = field.at(inside)[:, 1:]
         assert (logits >= low - 1e-5).all()
         assert (logits <= high + 1e-5).all()
+
+
+def test_a_map_judges_where_its_prior_has_looked(scene):
+    flat, shape = (fit_map(scene.observation, prior=prior) for prior in (None, "shape"))
+    points = np.random.default_rng(0).uniform([-0.4, -0.4, 0.0], [0.4, 0.4, 0.3], (4000, 3))
+    supported = np.asarray(flat.support(points)) >= 0.5
+    np.testing.assert_array_equal(flat.judges(points, 0.5), supported)
+    judged = shape.judges(points, 0.5)
+    assert (judged >= (np.asarray(shape.support(points)) >= 0.5)).all()
+    objects = shape.prior.logits(torch.from_numpy(points)).numpy()[:, 1:]
+    # There another object's grid says that it is not this one, or this one's own has looked.
+    assert (objects[shape.prior.covers(points)].min(axis=1) < objects[~judged].max()).all()
+    assert 0.1 < judged.mean() < 0.9
+
+
+def test_what_hides_in_the_grid_of_an_object_is_judged_and_what_hides_beyond_is_not(scene):
+    shape = fit_map(scene.observation)
+    bounds = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.3))
+    strict, trusting = (
+        World(shape, WorldConfig(occluded=policy, bounds=bounds))
+        for policy in ("occupied", "posterior")
+    )
+    points = np.random.default_rng(1).uniform(*bounds, (150_000, 3))
+    hidden = points[(strict.status(points) == 1) & (shape.occupancy(points) < 0.3)]
+    corners = 0.005 * np.array(list(product((-1.0, 1.0), repeat=3)))  # cells are 5 mm wide
+    around = np.stack([shape.judges(hidden + corner, 0.5) for corner in corners])
+    judged, beyond = around.all(axis=0), ~around.any(axis=0)
+    assert judged.sum() > 100
+    assert beyond.sum() > 100
+    assert (strict.field.lower_bound(hidden) <= 0.0).all()
+    free = trusting.field.lower_bound(hidden) > 0.0
+    assert free[judged].mean() > 0.5
+    assert not free[beyond].any()

@@ -90,6 +90,9 @@ class KernelMap:
     def support(self, points: np.ndarray) -> np.ndarray:
         return self._kernels(np.asarray(points)).sum(axis=1)
 
+    def judges(self, points: np.ndarray, min_support: float) -> np.ndarray:
+        return self.support(points) >= min_support
+
     def occupancy_log_odds(self, points: np.ndarray) -> np.ndarray:
         p = self.predict_proba(points)
         return np.clip(np.log(p[:, 1:].sum(axis=1)) - np.log(p[:, 0]), -40, 40)

@@ -441,7 +441,7 @@ class SpaceCodes:
             codes = np.asarray(world.status(points)).astype(np.uint8)
             codes[codes == OUTSIDE] = SEEN  # rounding at the faces
             hidden = np.flatnonzero(codes == OCCLUDED)
-            judged = np.asarray(world.map.support(points[hidden])) >= world.config.min_support
+            judged = world.map.judges(points[hidden], world.config.min_support)
             codes[hidden[judged]] = SEEN
             self._codes[start:stop] = codes.reshape(stop - start, *shape[1:])
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vprism_plan._kernels import mapping as kernels
@@ -169,6 +169,15 @@ class VPrismMap:
         if isinstance(points, Tensor):
             return self._torch_moments(points)[2].to(points.dtype)
         return self._moments(_checked_points(points))[2]
+
+    def judges(self, points: Any, min_support: float) -> Bool[np.ndarray, " n"]:
+        """Return where the map has more to say of points (N, 3) m than "nobody knows": (N,).
+
+        Where kernels reach (their mass is at least `min_support`), or the prior of the hidden side
+        has looked: around every object.
+        """
+        known = np.asarray(self.support(points)) >= min_support
+        return known if self.prior is None else known | self.prior.covers(np.asarray(points))
 
     def logit_moments(
         self, points: Any

@@ -227,6 +227,14 @@ class PriorField:
             columns.append(other.index_put((rows,), mixed))
         return torch.stack(columns, dim=1)
 
+    def covers(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Return which points (m) lie in the grid of an object, where it alone counts."""
+        last, inside = self.log_odds.shape[1] - 1, np.zeros(len(points), dtype=bool)
+        for pose in self.T_voxel_world:
+            at = points @ pose[:, :3].T + pose[:, 3]
+            inside |= (np.minimum(at, last - at) >= _FADE).all(axis=1)
+        return inside
+
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
         """Return the same for numpy points, float64."""
         with torch.no_grad():

@@ -193,8 +193,9 @@ class WorldConfig:
         occluded: what to do with space that a camera's ray would reach only through something it
             saw. "occupied" (default): it is an obstacle, also where the map's kernels reach: a
             posterior that extrapolates "empty" into a shadow can never make a hidden object
-            touchable. "posterior": where the map has support (kernel mass >= `min_support`) the
-            posterior decides; elsewhere it is an obstacle. "free": only the posterior decides.
+            touchable. "posterior": where the map has support (kernel mass >= `min_support`), or its
+            prior has looked, the posterior decides; elsewhere it is an obstacle. "free": only the
+            posterior decides.
         unobserved: the same for space outside every image or behind pixels without a depth return:
             "free" (default) or "occupied". Space outside the grid counts as unobserved.
         support: how far the support surface goes on. "unbounded": everything below its plane is an

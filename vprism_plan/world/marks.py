@@ -154,7 +154,7 @@ def _trust_posterior(
         if len(index) == 0:
             continue
         index = np.column_stack([np.full(len(index), x), index])
-        known = np.asarray(map_.support(corner + spacing * (index + 0.5))) >= config.min_support
+        known = map_.judges(corner + spacing * (index + 0.5), config.min_support)
         where = tuple((index[known] + first).T)
         whole = status[where] == kernels.OCCLUDED
         status[where] = np.where(whole, kernels.FREE, kernels.UNOBSERVED)

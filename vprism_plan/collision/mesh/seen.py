@@ -195,7 +195,7 @@ class HiddenSpace:
         rows = np.flatnonzero(hidden)
         if len(rows) == 0:
             return
-        known = np.asarray(self._map.support(points[rows])) >= 0.5 * self._config.min_support
+        known = self._map.judges(points[rows], 0.5 * self._config.min_support)
         for shadow in self._clutter:
             known &= visibility.classify_points([shadow], points[rows]) != visibility.OCCLUDED
         hidden[rows[known]] = False
