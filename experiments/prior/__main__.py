@@ -8,7 +8,6 @@ Examples go to the data folder, scene by scene; started again, it goes on where 
 
 import argparse
 import multiprocessing
-import sys
 import time
 from pathlib import Path
 
@@ -20,17 +19,18 @@ from vprism_plan.mapping.shape_network import ShapeNetwork, ShapePrior
 WEIGHTS = Path(__file__).parents[2] / "vprism_plan" / "data" / "shape_prior.safetensors"
 
 
-def origin_of(start: Path | None) -> dict[str, str]:
+def origin_of(chosen: argparse.Namespace) -> dict[str, str]:
     """Return the command and the commit, behind those that weights to start from came from."""
     from safetensors import safe_open
 
+    decides = [f"--{name} {getattr(chosen, name)}" for name in ("scenes", "steps", "seed", "rate")]
     origin = {
-        "command": f"python -m experiments.prior {' '.join(sys.argv[1:])}",
+        "command": " ".join(["python -m experiments.prior", *decides]),
         "commit": commit(),
     }
-    if start is None:
+    if chosen.start is None:
         return origin
-    with safe_open(start, "pt") as weights:
+    with safe_open(chosen.start, "pt") as weights:
         former = weights.metadata()
     return {name: f"{former[name]}; then {origin[name]}" for name in origin}
 
@@ -56,7 +56,7 @@ def main() -> int:
     parser.add_argument("--start", type=Path, help="weights to go on from")
     parser.add_argument("--output", type=Path, default=WEIGHTS)
     chosen = parser.parse_args()
-    origin = origin_of(chosen.start)
+    origin = origin_of(chosen)
     held_out, files = data_files(chosen.scenes, chosen.data)
     chosen.data.mkdir(parents=True, exist_ok=True)
     makers = multiprocessing.get_context("spawn").Pool(chosen.jobs)

@@ -36,8 +36,8 @@ class Pool:
     file that is not there yet.
     """
 
-    def __init__(self, files: Sequence[Path], rng: np.random.Generator) -> None:
-        self._files, self._rng = files, rng
+    def __init__(self, files: Sequence[Path], rng: np.random.Generator, first: int) -> None:
+        self._files, self._rng, self._first = files, rng, first
         self._parts: list[Examples] = []
         self._order: list[tuple[int, int]] = []
 
@@ -48,7 +48,7 @@ class Pool:
 
     def draw(self, step: int) -> Examples:
         """Return a batch for a step: every example once, in random order, then again."""
-        while len(self._parts) < min(len(self._files), _FIRST_FILES + step // _STEPS_PER_FILE):
+        while len(self._parts) < min(len(self._files), self._first + step // _STEPS_PER_FILE):
             path = self._files[len(self._parts)]
             while not path.exists():
                 time.sleep(1.0)
@@ -88,7 +88,7 @@ def train(
     average = _fast(ShapeNetwork())
     average.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=_DECAY)
-    pool = Pool(files, rng)
+    pool = Pool(files, rng, _FIRST_FILES if start is None else len(files))
     since, total = time.monotonic(), 0.0
     for step in range(steps):
         batch = pool.draw(step)
