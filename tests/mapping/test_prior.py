@@ -320,7 +320,7 @@ def test_what_hides_in_the_grid_of_an_object_is_judged_and_what_hides_beyond_is_
         World(shape, WorldConfig(occluded=policy, bounds=bounds))
         for policy in ("occupied", "posterior")
     )
-    points = np.random.default_rng(1).uniform(*bounds, (150_000, 3))
+    points = np.random.default_rng(1).uniform((-0.5, -0.5, 0.004), bounds[1], (150_000, 3))
     hidden = points[(strict.status(points) == 1) & (shape.occupancy(points) < 0.3)]
     corners = 0.005 * np.array(list(product((-1.0, 1.0), repeat=3)))  # cells are 5 mm wide
     around = np.stack([shape.judges(hidden + corner, 0.5) for corner in corners])
