@@ -13,13 +13,13 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import cKDTree
 
 from vprism_plan.errors import MapError
-from vprism_plan.mapping import MeshPrior, fit_map, load_map
+from vprism_plan.mapping import MapConfig, MeshPrior, fit_map, load_map
 from vprism_plan.mapping.prior import FLAT_OCCUPANCY, MOST, SIDE, Crop, PriorField, hidden_depth
 from vprism_plan.perception.plane import Plane
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scenes import Scene, render, upright
 from vprism_plan.simulation.solids import Box
-from vprism_plan.world import World, WorldConfig
+from vprism_plan.world import PosteriorWorlds, World, WorldConfig
 
 TABLE = Plane((0.0, 0.0, 1.0), 0.0)
 
@@ -331,3 +331,32 @@ def test_what_hides_in_the_grid_of_an_object_is_judged_and_what_hides_beyond_is_
     free = trusting.field.lower_bound(hidden) > 0.0
     assert free[judged].mean() > 0.5
     assert not free[beyond].any()
+
+
+def test_a_hypothesis_beyond_the_kernels_is_in_the_level_set_and_in_the_draws():
+    """Both looked where kernels reach only: the far end of a long hidden thing was free."""
+    camera = Camera.orbit(np.array([0.0, 0.0, 0.03]), 0.7, np.pi, np.deg2rad(20.0))
+    screen = Box((0.01, 0.05, 0.06), pose=upright(np.zeros(2), 0.06, 0.0))
+    alone = Scene((screen,), (1,), camera)
+    mesh = trimesh.creation.box((0.04, 0.04, 0.06))
+    mesh.apply_translation([0.11, 0.0, 0.03])
+    config = MapConfig(hinge_margin=0.01, hinge_radius=0.02)
+    fitted = fit_map(alone.observation, config, prior=MeshPrior({1: [(mesh, 1.0)]}))
+    inside = np.random.default_rng(0).uniform([0.095, -0.015, 0.01], [0.125, 0.015, 0.05], (99, 3))
+    lower, upper = fitted.space.bounds
+    hidden = inside[((inside < lower) | (inside > upper)).any(axis=1)]
+    hidden = hidden[fitted.occupancy(hidden) > 0.9]
+    assert len(hidden) > 5
+    field = World(fitted, WorldConfig(occluded="free")).certain_field(level_set=True, seen=False)
+    assert (field.lower_bound(hidden) <= 0.0).all()
+    draws = PosteriorWorlds(fitted, n_worlds=64, seed=0)
+    assert draws.touched(hidden, 0.005).mean() > 0.9
+
+
+def test_a_hypothesis_of_ones_own_judges_nothing_else_that_hides(scene):
+    ball = trimesh.creation.icosphere(radius=0.02)
+    label = scene.observation.object_ids[0]
+    fitted = fit_map(scene.observation, prior=MeshPrior({label: [(ball, 1.0)]}))
+    points = np.random.default_rng(0).uniform([-0.4, -0.4, 0.0], [0.4, 0.4, 0.3], (4000, 3))
+    supported = np.asarray(fitted.support(points)) >= 0.5
+    np.testing.assert_array_equal(fitted.judges(points, 0.5), supported)

@@ -105,9 +105,13 @@ class VPrismMap:
         return self.space.radius
 
     def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """Return the corners (m) of a box outside which `support` is exactly 0."""
+        """Return the corners (m) of a box outside which `support` is exactly 0, and the prior's
+        grids call everything empty: nothing of the objects is beyond it."""
         lower, upper = self.space.bounds
-        return lower.copy(), upper.copy()
+        if self.prior is None:
+            return lower.copy(), upper.copy()
+        low, high = self.prior.box
+        return np.minimum(lower, low), np.maximum(upper, high)
 
     @cached_property
     def unsupported_occupancy(self) -> float:
@@ -173,8 +177,8 @@ class VPrismMap:
     def judges(self, points: Any, min_support: float) -> Bool[np.ndarray, " n"]:
         """Return where the map has more to say of points (N, 3) m than "nobody knows": (N,).
 
-        Where kernels reach (their mass is at least `min_support`), or the prior of the hidden side
-        has looked: around every object.
+        Where kernels reach (their mass is at least `min_support`), or the package's prior has
+        looked: around every object.
         """
         known = np.asarray(self.support(points)) >= min_support
         return known if self.prior is None else known | self.prior.covers(np.asarray(points))

@@ -10,6 +10,8 @@ was seen overrules the guess, and what was not leaves it.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -208,6 +210,19 @@ class PriorField:
         """Edge of the finest grid's voxels, m."""
         return float(1.0 / np.linalg.norm(self.T_voxel_world[:, 0, :3], axis=1).max())
 
+    @cached_property
+    def box(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+        """Corners (m, world) of a box that holds all that the grids do not call surely empty."""
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for pose, grid in zip(self.T_voxel_world, self.log_odds, strict=True):
+            found = np.argwhere(grid > 1.0 - MOST)
+            if len(found):
+                ends = np.stack([found.min(axis=0) - 1.0, found.max(axis=0) + 1.0])
+                cube = np.array(list(product(*ends.T)))
+                world = np.linalg.solve(pose[:, :3], (cube - pose[:, 3]).T)
+                low, high = np.minimum(low, world.min(axis=1)), np.maximum(high, world.max(axis=1))
+        return low, high
+
     def logits(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
         """Return the prior means of all logits at points (m), differentiable, on their device."""
         last = self.log_odds.shape[1] - 1
@@ -228,9 +243,13 @@ class PriorField:
         return torch.stack(columns, dim=1)
 
     def covers(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return which points (m) lie in the grid of an object, where it alone counts."""
+        """Return which points (m) lie in the grid of an object, where it alone counts.
+
+        None do with a prior of the user's own: a hypothesis of an object says nothing of what else
+        hides there.
+        """
         last, inside = self.log_odds.shape[1] - 1, np.zeros(len(points), dtype=bool)
-        for pose in self.T_voxel_world:
+        for pose in () if self.own else self.T_voxel_world:
             at = points @ pose[:, :3].T + pose[:, 3]
             inside |= (np.minimum(at, last - at) >= _FADE).all(axis=1)
         return inside

@@ -135,7 +135,7 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     """Cover {P(occupied) >= level} with cells, the finest of them `spacing` (metres) wide.
 
     `map_` has `predict_proba`, `support_bounds`, `unsupported_occupancy` and `kernel_length`,
-    and may have a `prior` (`PriorField`) with a `detail` finer than the kernel.
+    and may have a `prior` (`PriorField`), and then `detail`, the edge of its voxels.
 
     Raises:
         WorldError: the map says "occupied" where it has no evidence at all, or the cells would fill
