@@ -4,6 +4,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.perception_oracles import Scene, intrinsics, look_at
@@ -121,6 +122,16 @@ def test_frayed_outlines_and_small_holes_have_no_cone():
     wide = gone.copy()
     wide[:, middle[1] - 10 :] = False
     assert set(map(tuple, np.argwhere(wide))) <= set(map(tuple, cone.pixels))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.3])
+def test_glass_with_a_few_stray_returns_keeps_its_cone(share):
+    """Specks that shine through are no frayed outline of anything."""
+    view = picture([around((0.0, 0.0, 0.1), (0.1, 0.1, 0.2))])
+    mask = view.labels == 1
+    lost = mask & (np.random.default_rng(0).random(mask.shape) >= share)
+    (cone,) = lost_cones(without_depth(view, lost), TABLE)
+    assert len(cone.pixels) > 0.95 * lost.sum()
 
 
 def test_seen_from_straight_above_it_is_as_tall_as_anything_on_a_table():

@@ -134,12 +134,11 @@ def sweep_draws(
                     x, y, z = rf[ri[17] + s], rf[ri[17] + ns + s], rf[ri[17] + 2 * ns + s]
                     gx, gy, gz = _voxel(T, f, x, y, z, spacing)
                     r = radii[s]
-                    need = (np.sqrt(r * r + 0.25 * step * step) + bend) / spacing + 1.0
-                    free = _away(gx, gy, gz, possible, corner) - need
+                    ball = (np.sqrt(r * r + 0.25 * step * step) + bend) / spacing
+                    free = _away(gx, gy, gz, possible, corner) - ball - 1.0
                     clear = min(clear, free)
                     if free > 0.0:
                         continue
-                    ball = need - 1.0
                     gx, gy, gz = gx - first[0], gy - first[1], gz - first[2]
                     found = touch_ball(
                         gx, gy, gz, ball, tables[s], distance_row, rows, lowest, scale, reach,

@@ -62,21 +62,21 @@ def classify(logits, n_draws, n_classes, out, odds):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _steeper(row, owner_row_value, owners, odds, counts, steepest):
+def _steeper(row, beside, owners, odds, counts, steepest):
     """Raise steepest (S,) to 1 / t, where t is the way, voxels, from occupied voxel `row` to the
-    surface on the way to its neighbour; nothing if that one is occupied, too."""
-    if owner_row_value < 0:
-        other = np.float32(-1 - owner_row_value)
+    surface on the way to its neighbour `beside`; nothing if that one is occupied, too."""
+    if beside < 0:
+        other = np.float32(-1 - beside)
         for s in range(steepest.size):
-            mine = np.float32(odds[row, s])
-            steepest[s] = max(steepest[s], (mine + other) / max(mine, np.float32(1.0)))
+            mine = max(np.float32(odds[row, s]), np.float32(1.0))
+            steepest[s] = max(steepest[s], (mine + other) / mine)
     else:
         for s in range(steepest.size):
             mine = max(np.float32(odds[row, s]), np.float32(1.0))
             # The surface between an object that counts and one that does not is half way.
-            other = -np.float32(odds[owner_row_value, s])
-            if owners[owner_row_value, s] != 0:
-                other = np.float32(-1e9) if counts[owners[owner_row_value, s]] else mine
+            other = -np.float32(odds[beside, s])
+            if owners[beside, s] != 0:
+                other = np.float32(-1e9) if counts[owners[beside, s]] else mine
             steepest[s] = max(steepest[s], (mine + other) / mine)
 
 

@@ -23,7 +23,7 @@ from vprism_plan.perception.camera import height_sigma, inlier_band, pixel_rays
 from vprism_plan.perception.plane import TableRegion, table_region
 from vprism_plan.world.distance import bounding, lower_bounds
 from vprism_plan.world.grid import Chosen, Grid, Image, Mask, Nodes, Points, Values, Vector
-from vprism_plan.world.visibility import FRAY, THIN, beside, without_fringe
+from vprism_plan.world.visibility import THIN, beside, without_fringe
 
 _STRAY_SHARE = 0.03  # as in the default map: fewer neighbours than this is a flying pixel
 _OFF = 0.004  # metres off the level set: no ball of 5 mm around a seen point may be free
@@ -104,12 +104,12 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     moved towards the camera by half its width; the height of 40 cm; and its own nearest seen
     surface, continued towards the camera at two metres per metre. Farthest is that surface
     continued away from the camera. Holes of up to four pixels, and outlines frayed by two, have no
-    cone: every depth camera has them all around.
+    cone: every depth camera has them all around. Specks of returns do not make a hole of glass.
     """
     found: list[Cone] = []
     for object_id in lost_objects(view):
         whole = view.labels == object_id
-        window = bounding(whole, FRAY)
+        window = bounding(whole, _BESIDE)
         mask, depth = whole[window], view.depth[window].astype(np.float64)
         lost = mask & (depth == 0)
         lost = without_fringe(lost, mask & ~lost)

@@ -16,6 +16,7 @@ from scipy.ndimage import (
     distance_transform_edt,
     maximum_filter,
     minimum_filter,
+    uniform_filter,
 )
 from scipy.spatial import cKDTree
 
@@ -351,15 +352,19 @@ def background_points(
     return np.concatenate(kept), np.concatenate(widths)
 
 
-FRAY = 2  # pixels by which masks and depth images are frayed along every outline
+_FRAY = 2  # pixels by which masks and depth images are frayed along every outline
+_LOCAL = 11  # pixels
 
 
-def without_fringe(found: Mask, beside: Mask) -> Mask:
-    """Leave out found pixels that reach no farther than `FRAY` from others: a fringe of these."""
-    if not beside.any():
+def without_fringe(found: Mask, others: Mask) -> Mask:
+    """Leave out found pixels that reach no farther than `_FRAY` from others, where these are more
+    in the `_LOCAL` pixels around: a fringe of theirs, and not a thing with specks."""
+    if not others.any():
         return found
-    deep = found & (distance_transform_edt(~beside) > FRAY)
-    return found & binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=FRAY)
+    deep = found & (distance_transform_edt(~others) > _FRAY)
+    kept = binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=_FRAY)
+    more = uniform_filter(found.astype(np.float64) - others, _LOCAL, mode="constant") > 0.0
+    return found & (kept | more)
 
 
 def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
