@@ -27,3 +27,19 @@ def owners_of(logits):
 def draw_owners(map_, points, n_worlds, seed):
     """(n, S): what each draw says of each point."""
     return owners_of(draw_logits(map_, points, n_worlds, seed))
+
+
+def in_cylinders(unseen, cylinders, index, n_worlds):
+    """(n, S): which voxels of the mask have their centres in a cylinder of each world."""
+    out = np.zeros((len(index), n_worlds), bool)
+    u, v = unseen.plane.axes()
+    for row, voxel in enumerate(np.asarray(index)):
+        local = voxel - unseen.first
+        if (local < 0).any() or (local >= unseen.mask.shape).any() or not unseen.mask[tuple(local)]:
+            continue
+        x = unseen.resolution * voxel
+        height = x @ unseen.plane.normal - unseen.plane.offset
+        for world, a, b, radius, top in cylinders:
+            near = np.hypot(x @ u - a, x @ v - b) <= radius
+            out[row, int(world)] |= near and height <= top
+    return out

@@ -270,10 +270,10 @@ def _touching(
         sweep.centers, sweep.slack, at.radii, at.sphere_tables, tables.distance_row, tables.rows,
         worlds.first, worlds.resolution, first, rows, owners, worlds.halo, sphere, owner,
     )  # fmt: skip
-    ids = at.world.map.object_ids
+    # The class after the map's is that of objects that nobody saw.
+    names = [*(f"object:{i}" for i in at.world.map.object_ids), "occluded"]
     return Counter(
-        (int(sphere[w]), f"object:{ids[owner[w] - 1]}", int(first[w]))
-        for w in np.flatnonzero(sphere >= 0)
+        (int(sphere[w]), names[owner[w] - 1], int(first[w])) for w in np.flatnonzero(sphere >= 0)
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
@@ -36,7 +36,7 @@ _BEHIND = 3.0  # voxels by which the crop lies behind the middle of what was see
 _BELOW, _ABOVE = 2.0, 3.0  # voxels under the support surface, and of room above the object
 _SEEN = 0.015  # metres in front of what was seen ...
 _WINDOW = 3  # ... by all pixels around: nothing is there
-_FADE = 2.0  # voxels from the side of a grid to where it alone counts
+FADE = 2.0  # voxels from the side of a grid to where it alone counts
 _COARSE = 0.025  # metres between the nodes around the grids ...
 _AROUND = 0.1  # ... and how far they reach beyond them
 _MOST_NODES = 200_000
@@ -229,7 +229,7 @@ class PriorField:
         places = [_transformed(pose, points) for pose in self.T_voxel_world]
         # From 0 at the sides of a grid and outside of it to 1 a few voxels inside.
         shares = [
-            (torch.minimum(at, last - at).amin(dim=1) / _FADE).clamp(0.0, 1.0) for at in places
+            (torch.minimum(at, last - at).amin(dim=1) / FADE).clamp(0.0, 1.0) for at in places
         ]
         covered = torch.stack(shares).amax(dim=0)
         flat = _sampled(self.elsewhere, _transformed(self.T_node_world, points))
@@ -251,8 +251,24 @@ class PriorField:
         last, inside = self.log_odds.shape[1] - 1, np.zeros(len(points), dtype=bool)
         for pose in () if self.own else self.T_voxel_world:
             at = points @ pose[:, :3].T + pose[:, 3]
-            inside |= (np.minimum(at, last - at) >= _FADE).all(axis=1)
+            inside |= (np.minimum(at, last - at) >= FADE).all(axis=1)
         return inside
+
+    def nearest(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+        """Return the grid whose part that alone counts is nearest to each point (m), and where in
+        it, voxels."""
+        end = self.log_odds.shape[1] - 1 - FADE
+        best, grid = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+        place = np.zeros((len(points), 3))
+        for k, pose in enumerate(self.T_voxel_world):
+            at = points @ pose[:, :3].T + pose[:, 3]
+            inside = at.clip(FADE, end)
+            away = np.linalg.norm(at - inside, axis=1) / np.linalg.norm(pose[0, :3])
+            nearer = away < best
+            best[nearer], grid[nearer], place[nearer] = away[nearer], k, inside[nearer]
+        return grid, place
 
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
         """Return the same for numpy points, float64."""
@@ -274,7 +290,7 @@ class PriorField:
         ]
         insides = [(np.minimum(at, last - at), reach) for *_, at, reach in grids]
         touched = np.stack([(i > -reach).all(axis=1) for i, reach in insides], axis=1)
-        held = np.stack([(i >= _FADE + reach).all(axis=1) for i, reach in insides], axis=1)
+        held = np.stack([(i >= FADE + reach).all(axis=1) for i, reach in insides], axis=1)
         flat_low, flat_high, *_ = _extremes(self.elsewhere, self.T_node_world, centers, half)
         other_low = np.where(touched.any(axis=1), -MOST, flat_low)[:, None]
         other_high = np.where(held.any(axis=1), -MOST, flat_high)[:, None]

@@ -235,6 +235,8 @@ def _field(worlds: Any, world: Any, kind: str) -> Grid:
         if kind == "occupancy":
             field[row >= 0] = 1.0
             values = np.asarray(world.map.occupancy(points))
+            alone = row[tuple(drawn.T)] >= worlds.unseen_row
+            values[alone] = (worlds.owners(drawn[alone] + first) > 0).mean(axis=1)
         else:
             values = np.asarray(world.map.entropy(points))
             values[np.asarray(world.map.support(points)) < world.config.min_support] = 0.0

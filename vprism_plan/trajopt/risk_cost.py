@@ -92,7 +92,8 @@ class _DrawField:
         inner = tuple(slice(halo, n - halo) for n in grid.shape)
         index = np.moveaxis(np.indices([s.stop - s.start for s in inner]), 0, -1).reshape(-1, 3)
         owners = worlds.owners(index + low + halo)
-        ids = [None, *worlds.map.object_ids]
+        # Free, the map's classes, and the class of objects that nobody saw.
+        ids = [None, *worlds.map.object_ids, "unseen"]
         self.steps = np.empty((len(rules), *grid.shape, n_worlds), dtype=np.int16)
         for g, gone in enumerate(rules):
             counts = np.array([k is not None and k not in gone for k in ids])

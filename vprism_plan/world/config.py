@@ -194,8 +194,16 @@ class WorldConfig:
             saw. "occupied" (default): it is an obstacle, also where the map's kernels reach: a
             posterior that extrapolates "empty" into a shadow can never make a hidden object
             touchable. "posterior": where the map has support (kernel mass >= `min_support`), or its
-            prior has looked, the posterior decides; elsewhere it is an obstacle. "free": only the
-            posterior decides.
+            prior has looked, the posterior decides; what lies farther from every object is judged
+            by `hidden_objects`. "free": only the posterior decides.
+        hidden_objects: how many objects that nobody saw stand on a square metre of hidden support
+            surface (policy "posterior"). Where the map has nothing to say, draws of the posterior
+            hold so many of them, as cylinders 4 to 12 cm wide and 3 to 25 cm high, so bounds on
+            risk count them; the field, and verdicts without such a bound, take that space for
+            free: any one place is nearly always. It stays an obstacle behind unlabelled clutter,
+            where the prior's guess is cut off by the end of what it looked at, outside the grid,
+            for maps without a prior or with one of your own, without a plane and with
+            `support="seen"`. 0: that space is free; infinite: it is an obstacle.
         unobserved: the same for space outside every image or behind pixels without a depth return:
             "free" (default) or "occupied". Space outside the grid counts as unobserved.
         support: how far the support surface goes on. "unbounded": everything below its plane is an
@@ -233,6 +241,7 @@ class WorldConfig:
     occlusion_tolerance: float = 0.01
     background_height: float = 0.015
     lone_share: float | None = None
+    hidden_objects: float = 2.0
 
     def __post_init__(self) -> None:
         number("resolution", self.resolution, 1e-4, 1.0, "metres")
@@ -242,6 +251,7 @@ class WorldConfig:
         number("background_height", self.background_height, 0.0, 1.0, "metres")
         if self.lone_share is not None:
             number("lone_share", self.lone_share, 0.0, 0.25, "(a share)")
+        number("hidden_objects", self.hidden_objects, 0.0, unit="per square metre", finite=False)
         choice("occluded", self.occluded, get_args(OccludedPolicy))
         choice("unobserved", self.unobserved, get_args(UnobservedPolicy))
         choice("support", self.support, get_args(SupportExtent))

@@ -4,11 +4,12 @@ saw, seen surfaces, known meshes."""
 
 import math
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
 from vprism_plan._kernels import world as kernels
@@ -16,7 +17,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.world import visibility
 from vprism_plan.world.config import KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import Lattice, bounding, lattice_nodes
-from vprism_plan.world.grid import Grid, Nodes, Points, Values, Vector, corners, window
+from vprism_plan.world.grid import Grid, Nodes, Points, Shape3, Values, Vector, corners, window
 from vprism_plan.world.seen import (
     Cone,
     Surface,
@@ -27,6 +28,7 @@ from vprism_plan.world.seen import (
     surface_points,
 )
 from vprism_plan.world.sources import LAST_MARK, MARKED
+from vprism_plan.world.unseen_objects import OpenSides, UnseenObjects, open_sides
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
 
@@ -39,6 +41,8 @@ class Evidence:
         below: the same for which the support plane hides things, too; None if it never ends.
         without_depth: labels without any return, sorted: no class of the map. Their marks follow
             those of the classes, LAST_MARK + C + 1 and on.
+        unseen: objects that may stand in hidden space which `marks` has left to them; None before,
+            and if there is no such space.
     """
 
     def __init__(self, map_: Any, config: WorldConfig) -> None:
@@ -49,6 +53,8 @@ class Evidence:
         self.below = visibility.make_views(map_.views, tolerance) if self.bounded else None
         found = {i for view in map_.views for i in lost_objects(view)}
         self.without_depth = tuple(sorted(found - set(map_.object_ids)))
+        self._sides = open_sides(map_, config, self.views)
+        self.unseen: UnseenObjects | None = None
 
     @cached_property
     def _clutter(self) -> tuple[Points, Values]:
@@ -84,7 +90,13 @@ class Evidence:
             else:
                 status = visibility.classify_cells_around(self.views, self.below, *place)
             if occluded == "posterior":
-                _trust_posterior(self._map, self._config, status, grid.origin, spacing)
+                left = _trust_posterior(
+                    self._map, self._config, status, grid.origin, spacing, self._sides
+                )
+                if self._sides is not None and self.unseen is None:
+                    self.unseen = UnseenObjects.among(
+                        left, grid, self._map.plane, self._config.hidden_objects
+                    )
             if inner is not None:
                 # Cells that lie wholly inside the other box.
                 low = np.ceil((inner.origin - grid.origin) / spacing - 1e-9)
@@ -131,33 +143,59 @@ def _trust_posterior(
     status: UInt8[np.ndarray, "nx ny nz"],
     origin: Vector,
     spacing: float,
-) -> None:
+    sides: OpenSides | None,
+) -> Bool[np.ndarray, "nx ny nz"]:
     """Call occluded cells free where the map has support: the posterior decides there. Not
-    behind unlabelled clutter: the map has no class for that."""
+    behind unlabelled clutter: the map has no class for that. With `sides`, also what lies beyond,
+    but for what these keep: return those cells."""
+    left = np.zeros(status.shape, dtype=bool)
     lower, upper = (np.asarray(c) for c in map_.support_bounds())
     first = np.clip(np.floor((lower - origin) / spacing).astype(int), 0, status.shape)
     last = np.clip(np.ceil((upper - origin) / spacing).astype(int), first, status.shape)
+    if sides is not None:
+        shadows = (status == kernels.OCCLUDED) | (status == kernels.PARTLY)
+        box = bounding(shadows, 0) if shadows.any() else (slice(0, 0),) * 3
+        first, last = np.array([[side.start, side.stop] for side in box]).T
     hidden = status[window(first, last)]
     hidden = (hidden == kernels.OCCLUDED) | (hidden == kernels.PARTLY)
     if not hidden.any():
-        return
-    corner, size = origin + spacing * first, hidden.shape
-    for view in map_.views:
-        start = visibility.clutter_depth(view, map_.plane, config)
-        if np.isfinite(start).any():
-            plane = None if config.support == "seen" else map_.plane
-            shadow = [visibility.shadow_behind(view, start)]
-            behind = visibility.classify_cells(shadow, plane, corner, spacing, size)
-            hidden &= (behind != kernels.OCCLUDED) & (behind != kernels.PARTLY)
-    for x in range(size[0]):
+        return left
+    corner = origin + spacing * first
+    hidden &= ~_behind_clutter(map_, config, corner, spacing, hidden.shape)
+    flat = np.zeros(hidden.shape, dtype=bool)
+    if sides is not None:  # the foot of clutter is no business of unseen objects, either
+        low = replace(config, background_height=visibility.THIN)
+        flat = _behind_clutter(map_, low, corner, spacing, hidden.shape)
+    for x in range(len(hidden)):
         index = np.argwhere(hidden[x])
         if len(index) == 0:
             continue
         index = np.column_stack([np.full(len(index), x), index])
-        known = map_.judges(corner + spacing * (index + 0.5), config.min_support)
+        points = corner + spacing * (index + 0.5)
+        known = map_.judges(points, config.min_support)
+        if sides is not None:
+            beyond = np.flatnonzero(~known & ~flat[tuple(index.T)])
+            beyond = beyond[~sides.reach(points[beyond])]
+            left[tuple((index[beyond] + first).T)] = known[beyond] = True
         where = tuple((index[known] + first).T)
         whole = status[where] == kernels.OCCLUDED
         status[where] = np.where(whole, kernels.FREE, kernels.UNOBSERVED)
+    return left
+
+
+def _behind_clutter(
+    map_: Any, config: WorldConfig, corner: Vector, spacing: float, size: Shape3
+) -> Bool[np.ndarray, "nx ny nz"]:
+    """Which cells unlabelled clutter hides in any view."""
+    found = np.zeros(size, dtype=bool)
+    plane = None if config.support == "seen" else map_.plane
+    for view in map_.views:
+        start = visibility.clutter_depth(view, map_.plane, config)
+        if np.isfinite(start).any():
+            shadow = [visibility.shadow_behind(view, start)]
+            behind = visibility.classify_cells(shadow, plane, corner, spacing, size)
+            found |= (behind == kernels.OCCLUDED) | (behind == kernels.PARTLY)
+    return found
 
 
 def unmark(marks: Lattice, classes: Collection[int], inside: Lattice | None = None) -> Lattice:

@@ -4,7 +4,7 @@
 import copy
 import threading
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
 from vprism_plan.world.distance import checked_points
 from vprism_plan.world.grid import Chosen, Index, Points, Shape3, Slices, Values, window
+from vprism_plan.world.unseen_objects import UnseenObjects
 
 _MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
 _FINEST = 16.0  # stored steps per voxel, at most
@@ -63,6 +64,7 @@ class PosteriorWorlds:
             ball that will be asked about. At most 31 voxels.
         tolerance: how probable it may be that skipping the draws of nearly certain voxels changes
             any answer.
+        unseen: objects that nobody saw, on voxels of the same resolution; each draw holds some.
 
     Attributes:
         error_free: bound on the probability that a draw differs in a voxel that was called free
@@ -84,6 +86,7 @@ class PosteriorWorlds:
         resolution: float = 0.01,
         reach: float = 0.2,
         tolerance: float = 1e-3,
+        unseen: UnseenObjects | None = None,
     ) -> None:
         if whole("n_worlds", n_worlds, 64, error=WorldError) % 64:
             raise WorldError(f"n_worlds is {n_worlds}; it must be a multiple of 64")
@@ -102,7 +105,9 @@ class PosteriorWorlds:
         verdicts = judge(map, self.resolution, tolerance)
         self.error_free = verdicts.error_free
         self.error_occupied = verdicts.error_occupied
-        self._owners = Owners(map, n_worlds, seed, self.resolution, verdicts)
+        if unseen is not None:
+            verdicts = _left_to(unseen, verdicts, len(map.object_ids))
+        self._owners = Owners(map, n_worlds, seed, self.resolution, verdicts, unseen)
 
         self._reach = reach / self.resolution  # voxels
         self._whole = int(self._reach)
@@ -159,8 +164,8 @@ class PosteriorWorlds:
 
     def owners(self, index: Int[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "n s"]:
         """Return which object occupies each voxel (centres are `resolution * index`, metres) in
-        each draw: 0 free, k the object `map.object_ids[k - 1]`; WorldError if index is not (n, 3)
-        integers."""
+        each draw: 0 free, k the object `map.object_ids[k - 1]`, one more than there are classes an
+        object that nobody saw; WorldError if index is not (n, 3) integers."""
         index = np.asarray(index)
         if index.ndim != 2 or index.shape[1] != 3 or not np.issubdtype(index.dtype, np.integer):
             raise WorldError(
@@ -217,6 +222,11 @@ class PosteriorWorlds:
         """Bytes held now, by voxel indices, owners and distances."""
         parts = self._owners, self._grown, self.tables.distance_row, self.tables.rows
         return sum(int(p.nbytes) for p in parts)
+
+    @property
+    def unseen_row(self) -> int:
+        """First row of the owners of voxels that only unseen objects may occupy."""
+        return len(self.map.object_ids) + self._owners.judged
 
     @property
     def owner_tables(self) -> tuple[Any, Any, Any]:
@@ -344,13 +354,30 @@ def classes_of(map_: Any, object_ids: Collection[int]) -> list[int]:
 @dataclass(frozen=True, eq=False)
 class Verdicts:
     """What every draw is taken to say of each voxel before any is drawn, as `Owners` keeps it;
-    bounds on the probability that a draw differs in any voxel called free, or occupied."""
+    bounds on the probability that a draw differs in any voxel called free, or occupied. The map
+    calls the last of the voxels free, at log-odds of -free / ODDS: only unseen objects may occupy
+    them."""
 
     first: Index
     row: Int32[np.ndarray, "nx ny nz"]
     voxels: Int[np.ndarray, "n 3"]
     error_free: float
     error_occupied: float
+    free: Int8[np.ndarray, " m"] = field(default_factory=lambda: np.empty(0, np.int8))
+
+
+def _left_to(unseen: UnseenObjects, found: Verdicts, n_objects: int) -> Verdicts:
+    """Have what unseen objects may occupy drawn as well."""
+    ends = found.first + found.row.shape, unseen.first + unseen.mask.shape
+    first = np.minimum(found.first, unseen.first)
+    row = np.full(np.maximum(*ends) - first, -1 - kernels.MOST_ODDS, np.int32)
+    row[window(found.first - first, ends[0] - first)] = found.row
+    part = row[window(unseen.first - first, ends[1] - first)]
+    added = unseen.mask & (part < 0)
+    free = (-1 - part[added]).astype(np.int8)
+    part[added] = n_objects + len(found.voxels) + np.arange(len(free), dtype=np.int32)
+    voxels = [found.voxels + found.first - first, np.argwhere(added) + unseen.first - first]
+    return replace(found, first=first, row=row, voxels=np.concatenate(voxels), free=free)
 
 
 def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
@@ -435,16 +462,20 @@ class Owners:
         row: (nx, ny, nz) int32: a row of `table`, or -1 - q: free in every draw, at
             log-odds of -q / ODDS in nearly all.
         voxels: (n, 3) those that have to be drawn, in the order of their rows.
+        judged: how many of them, the first ones, the map has something to say of.
         table: (r, S) uint8: one row per object, then one per voxel: 0 free, k the object
-            `map.object_ids[k - 1]`; not filled before its block is drawn.
+            `map.object_ids[k - 1]`, one more an unseen one; not filled before its block is drawn.
         odds: (r, S) int8: log-odds of being occupied, times ODDS.
     """
 
     def __init__(
-        self, map_: Any, n_worlds: int, seed: int, resolution: float, verdicts: Verdicts
-    ) -> None:
+        self, map_: Any, n_worlds: int, seed: int, resolution: float, verdicts: Verdicts,
+        unseen: UnseenObjects | None,
+    ) -> None:  # fmt: skip
         self.first, self.row, self.voxels = verdicts.first, verdicts.row, verdicts.voxels
         self._map, self._n_worlds, self._resolution = map_, n_worlds, resolution
+        self._free, self._unseen = verdicts.free, unseen
+        self.judged = len(self.voxels) - len(self._free)
         self._seed = seed
         self._weights: np.ndarray | None = None
         n_objects = len(map_.object_ids)
@@ -458,6 +489,12 @@ class Owners:
         starts = np.arange(int(np.prod(self._shape)) + 1)
         self._block_start = np.searchsorted(key[self._by_block], starts).astype(np.int64)
         self._drawn = np.diff(self._block_start) == 0
+        self._stand()
+
+    def _stand(self) -> None:
+        """Draw the unseen objects."""
+        if self._unseen is not None:
+            self._cylinders = self._unseen.draw(self._n_worlds, self._seed)
 
     def redrawn(self, seed: int) -> "Owners":
         """Return the owners in as many other draws, none of them drawn yet."""
@@ -465,6 +502,7 @@ class Owners:
         other._seed, other._weights = seed, None
         other.table, other.odds = self.table.copy(), self.odds.copy()
         other._drawn = np.diff(self._block_start) == 0
+        other._stand()
         return other
 
     def snapshot(self) -> "Owners":
@@ -517,12 +555,17 @@ class Owners:
         for block in blocks[~self._drawn[blocks]]:
             piece = slice(int(self._block_start[block]), int(self._block_start[block + 1]))
             members = self._by_block[piece]
-            points = self._resolution * (self.voxels[members] + self.first)
-            found = np.empty((len(members), self._n_worlds), np.uint8)
+            index = self.voxels[members] + self.first
+            points = self._resolution * index
+            found = np.zeros((len(members), self._n_worlds), np.uint8)
             odds = np.empty(found.shape, np.int8)
-            for start in range(0, len(points), _GEMM_ROWS):
-                rows = slice(start, start + _GEMM_ROWS)
+            end = int(np.searchsorted(members, self.judged))  # members are in order
+            for start in range(0, end, _GEMM_ROWS):
+                rows = slice(start, min(start + _GEMM_ROWS, end))
                 self._classify(points[rows], found[rows], odds[rows])
+            odds[end:] = -self._free[members[end:] - self.judged, None]
+            if self._unseen is not None:
+                self._unseen.stand(index, self._cylinders, first_row + 1, found, odds)
             self.table[first_row + members] = found
             self.odds[first_row + members] = odds
             self._drawn[block] = True

@@ -273,11 +273,11 @@ class World:
     ) -> DistanceField:
         """Distance to what is an obstacle whatever the posterior says: background, seen parts that
         the level set misses, known geometry, unobserved space by its policy, and occluded space
-        where the map has too little support to judge (unless the policy is "free"). The rest is for
-        `posterior_worlds` to say; with `level_set`, the objects where P(occupied) >= level belong
-        to it as well. The objects `without`, and their seen parts, are left out. With `seen`, so
-        does whatever was seen of an object, wherever the level set is. WorldError if the map has no
-        such object."""
+        where the map has too little support to judge (unless the policy is "free", or leaves it to
+        `WorldConfig.hidden_objects`). The rest is for `posterior_worlds` to say; with `level_set`,
+        the objects where P(occupied) >= level belong to it as well. The objects `without`, and
+        their seen parts, are left out. With `seen`, so does whatever was seen of an object,
+        wherever the level set is. WorldError if the map has no such object."""
         gone = frozenset(classes_of(self.map, without))
         key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
         if key not in self._cache:
@@ -349,10 +349,14 @@ class World:
         self, n_worlds: int = 256, seed: int = 0, reach: float = 0.2
     ) -> PosteriorWorlds:
         """Return joint draws of the map on voxels of this world's resolution, as
-        `PosteriorWorlds` does; those with at least this reach are kept and shared."""
+        `PosteriorWorlds` does, and of objects that nobody saw (`WorldConfig.hidden_objects`);
+        those with at least this reach are kept and shared."""
         kept = self._draws.get((n_worlds, seed))
         if kept is None or kept.reach < reach:
-            kept = PosteriorWorlds(self.map, n_worlds, seed, self.config.resolution, reach)
+            kept = PosteriorWorlds(
+                self.map, n_worlds, seed, self.config.resolution, reach,
+                unseen=self._evidence.unseen,
+            )  # fmt: skip
             self._draws[n_worlds, seed] = kept
         return kept
 

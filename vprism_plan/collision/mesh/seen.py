@@ -14,6 +14,7 @@ from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
 from vprism_plan.world.grid import Chosen, Points, Values
 from vprism_plan.world.seen import lost_cones, lost_points, surface_points
+from vprism_plan.world.unseen_objects import open_sides
 
 SEEN = "a camera saw it there"  # the detail of contacts with observed points
 _CELL = 0.03  # metres: one sample of a solid's surface per cube of this edge
@@ -143,7 +144,8 @@ class HiddenSpace:
             start = visibility.clutter_depth(view, map_.plane, config)
             if config.occluded == "posterior" and np.isfinite(start).any():
                 self._clutter.append(visibility.shadow_behind(view, start))
-        self._judged = judged_field(world)
+        self._sides = open_sides(map_, config, self._views)
+        self._near, self._judged = world.field, judged_field(world)
         self._ends = self._judged is not world.field or config.unobserved == "occupied"
         self._idle = (not self._views or config.occluded == "free") and not self._ends
         self._solid, self._samples, self._outward = _samples(placed)
@@ -190,12 +192,17 @@ class HiddenSpace:
         return codes
 
     def _leave_to_posterior(self, points: Points, hidden: Chosen) -> None:
-        """Call what the map has support for not hidden, unless clutter hides it. Half the support
-        is enough here: the world asks at the middle of a cell."""
+        """Call what the map has support for not hidden, or what is left to unseen objects, unless
+        clutter hides it. Half the support is enough here: the world asks at the middle of a cell.
+        """
         rows = np.flatnonzero(hidden)
         if len(rows) == 0:
             return
         known = self._map.judges(points[rows], 0.5 * self._config.min_support)
+        if self._sides is not None:
+            lower, upper = self._near.origin, self._near.upper
+            inside = ((points[rows] >= lower) & (points[rows] <= upper)).all(axis=1)
+            known |= inside & ~self._sides.reach(points[rows])
         for shadow in self._clutter:
             known &= visibility.classify_points([shadow], points[rows]) != visibility.OCCLUDED
         hidden[rows[known]] = False
