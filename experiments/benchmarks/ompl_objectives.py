@@ -12,6 +12,7 @@ search has seen. Answers are kept under build/objectives; a run goes on where on
 
 import argparse
 import json
+import math
 import time
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -74,7 +75,9 @@ class Bench:
             vp.fit_map(scene_of("solids", seed).observation, vp.MapConfig(), seed=0).save(file)
         self.seed = seed
         self.robot = benchmark_robot()
-        self.world = vp.World(load_map(file), vp.WorldConfig(occluded="posterior"))
+        # What the objectives are told apart by are the objects of the map.
+        config = vp.WorldConfig(occluded="posterior", hidden_objects=math.inf)
+        self.world = vp.World(load_map(file), config)
         self.checker = CollisionChecker(self.world, self.robot)
         self.wary = CollisionChecker(self.world, self.robot, CheckerConfig(margin=0.02))
         self.judge = CollisionChecker(self.world, self.robot, CheckerConfig(**JUDGES))

@@ -23,12 +23,13 @@ class CheckerConfig:
             two checked configurations. A point of such a gap is at most half of it away from a
             configuration known to be free: the tolerance of `check_motion`.
         max_risk: bound on the probability of collision. With a bound, the objects of the map (and
-            occluded space where the map has support) are judged by worlds drawn from its posterior,
-            at P(occupied) = 1/2 of each draw whatever `WorldConfig.level` is: a configuration or an
-            edge is free if the upper confidence bound of its probability of coming within `margin`
-            is at most `max_risk`. Everything else is refused as without a bound, and so is the
-            level set if `max_risk` is below its level: draws are counted by voxels, and alone would
-            let a path shave a surface that was seen. None: level set.
+            occluded space where the map has support, or `WorldConfig.hidden_objects` judges it) are
+            judged by worlds drawn from its posterior, at P(occupied) = 1/2 of each draw whatever
+            `WorldConfig.level` is: a configuration or an edge is free if the upper confidence bound
+            of its probability of coming within `margin` is at most `max_risk`. Everything else is
+            refused as without a bound, and so is the level set if `max_risk` is below its level:
+            draws are counted by voxels, and alone would let a path shave a surface that was seen.
+            None: level set.
         allowed_contacts: link or SRDF group -> ids of the objects it may touch; for example
             {"hand": {3}}. What a link may touch, it may also pass through.
         n_worlds: worlds drawn for probabilities, a multiple of 64.

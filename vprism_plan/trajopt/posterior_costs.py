@@ -169,7 +169,8 @@ class OccupancyCost(_PosteriorCost):
     surface, half-spaces), as an independent cause with -ln(1 - P) = ln(1 + exp(-e / w)), e the
     sphere's gap as in `ClearanceCost` and w half a voxel: slope 1 / w however deep, and led to
     0 at a gap of 8 w. A checker's margin counts as part of the spheres, and objects that a link
-    may touch do not count for it.
+    may touch do not count for it. Objects that nobody saw (`WorldConfig.hidden_objects`) are none
+    of these: only draws hold them.
 
     Args:
         world: a `VPrismMap`, a `World` or a `CollisionChecker`.

@@ -203,7 +203,7 @@ class WorldConfig:
             free: any one place is nearly always. It stays an obstacle behind unlabelled clutter,
             where the prior's guess is cut off by the end of what it looked at, outside the grid,
             for maps without a prior or with one of your own, without a plane and with
-            `support="seen"`. 0: that space is free; infinite: it is an obstacle.
+            `support="seen"`. 0: that space is free; above 1000, or infinite: it is an obstacle.
         unobserved: the same for space outside every image or behind pixels without a depth return:
             "free" (default) or "occupied". Space outside the grid counts as unobserved.
         support: how far the support surface goes on. "unbounded": everything below its plane is an

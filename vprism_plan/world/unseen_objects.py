@@ -18,6 +18,7 @@ from vprism_plan.world.grid import Chosen, Grid, Index, Points
 
 RADII = 0.02, 0.06  # metres, the least and the greatest
 HEIGHTS = 0.03, 0.25  # metres over the support surface
+_MOST = 1000.0  # of them per square metre: with more there is no room left
 _GOES_ON = 0.1  # P(occupied) from which a guess counts as cut off by the side of its grid
 _STREAM = 0x0B1EC75  # other random numbers than the weights'
 
@@ -55,10 +56,10 @@ def open_sides(
     map_: Any, config: WorldConfig, views: Sequence[visibility.View]
 ) -> OpenSides | None:
     """Return what says where hidden space is no business of unseen objects; None if it never is:
-    they stand on a support surface that goes on, and are fewer than infinitely many, in space that
-    a prior of the package's own would have known of if it were an object's."""
+    they stand on a support surface that goes on, not too many of them, in space that a prior of
+    the package's own would have known of if it were an object's."""
     prior = getattr(map_, "prior", None)
-    if config.occluded != "posterior" or not np.isfinite(config.hidden_objects):
+    if config.occluded != "posterior" or config.hidden_objects > _MOST:
         return None
     if prior is None or prior.own or map_.plane is None or config.support == "seen":
         return None
