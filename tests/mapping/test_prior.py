@@ -316,9 +316,9 @@ def test_a_map_judges_where_its_prior_has_looked(scene):
 def test_what_hides_in_the_grid_of_an_object_is_judged_and_what_hides_beyond_is_not(scene):
     shape = fit_map(scene.observation)
     bounds = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.3))
-    strict, trusting = (
-        World(shape, WorldConfig(occluded=policy, bounds=bounds))
-        for policy in ("occupied", "posterior")
+    strict, trusting, leaving = (
+        World(shape, WorldConfig(occluded=policy, bounds=bounds, hidden_objects=number))
+        for policy, number in (("occupied", np.inf), ("posterior", np.inf), ("posterior", 2.0))
     )
     points = np.random.default_rng(1).uniform((-0.5, -0.5, 0.004), bounds[1], (150_000, 3))
     hidden = points[(strict.status(points) == 1) & (shape.occupancy(points) < 0.3)]
@@ -331,6 +331,9 @@ def test_what_hides_in_the_grid_of_an_object_is_judged_and_what_hides_beyond_is_
     free = trusting.field.lower_bound(hidden) > 0.0
     assert free[judged].mean() > 0.5
     assert not free[beyond].any()
+    left = leaving.field.lower_bound(hidden) > 0.0  # with few unseen objects the draws judge it
+    assert left[beyond].mean() > 0.5
+    assert left[free].all()
 
 
 def test_a_hypothesis_beyond_the_kernels_is_in_the_level_set_and_in_the_draws():
