@@ -20,8 +20,8 @@ from typing import Any
 
 from vprism_plan.errors import ConfigError, VPrismError
 
-_SCENES = {"planning": 30, "uncertainty": 30}  # 100 for the others
-_TABLES = ("baselines", "sampling", "presets", "uncertainty", "planning")
+_SCENES = {"planning": 30, "asked": 30, "uncertainty": 30}  # 100 for the others
+_TABLES = ("baselines", "sampling", "presets", "uncertainty", "planning", "asked")
 _SETS = ("all", "analytic", "ycb", "random", "random-train", "folder")
 Command = argparse.Namespace
 
@@ -46,11 +46,13 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     what = (
         "what to compare: reconstruction by V-PRISM and others, by its negative sampling, by its "
-        "presets; uncertainty by SGD; collision checkers"
+        "presets; uncertainty by SGD; collision checkers, about vetted ends or goals from the image"
     )
     add("table", choices=_TABLES, help=what)
     add("--set", choices=_SETS, default="all", help='"all" is analytic, ycb and random')
-    count = "of each set, default 100, uncertainty 30; of all sets together for planning, 30"
+    count = (
+        "of each set, default 100, uncertainty and asked 30; of all sets together for planning, 30"
+    )
     add("--scenes", type=int, help=count)
     add("--first-seed", type=int, default=1000, help="0 to 99 are for tuning; default 1000")
     add("--methods", nargs="+", default=[], metavar="KEY", help="only these rows, in this order")
@@ -78,7 +80,7 @@ def _run(command: Command) -> int:
     if command.output is None:
         total = scenes if command.table == "planning" else scenes * len(kinds)
         _keep_larger(output / f"{command.table}.json", total)
-    runs = {"planning": _planning, "uncertainty": _uncertainty}
+    runs = {"planning": _planning, "asked": _asked, "uncertainty": _uncertainty}
     own = command.table if command.table in runs else "reconstruction"
     asked = {
         "kinds": kinds, "scenes": scenes, "first_seed": command.first_seed, "data": command.data,
@@ -118,7 +120,7 @@ def _keep_larger(file: Path, scenes: int) -> None:
         found = json.loads(file.read_text(encoding="utf-8"))
         there = (
             sum(found["about"]["kinds"].values())
-            if file.stem == "planning"
+            if file.stem in ("planning", "asked")
             else sum(own["scenes"] for own in found["sets"].values())
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -208,6 +210,18 @@ def _planning(_: str, checkers: Sequence[str], asked: dict[str, Any]) -> Report:
         for key, row in figures["contenders"].items()
     ]
     return {"contenders": figures["contenders"], "claims": figures["statements"]}, lines, files
+
+
+def _asked(_: str, checkers: Sequence[str], asked: dict[str, Any]) -> Report:
+    """Ask for goals that were proposed from the image."""
+    from experiments.planning_benchmark.asked import benchmark
+
+    figures, files = benchmark(checkers=checkers or None, **asked)
+    lines = [
+        f"{key}: of {row['asked']} answered {row['answered']}, true collisions {row['collided']}"
+        for key, row in figures["contenders"].items()
+    ]
+    return {name: figures[name] for name in ("contenders", "calibration")}, lines, files
 
 
 def _uncertainty(_: str, __: Sequence[str], asked: dict[str, Any]) -> Report:

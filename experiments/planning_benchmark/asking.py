@@ -15,6 +15,7 @@ from experiments.planning_benchmark.checkers import Bench
 from experiments.planning_benchmark.contenders import Contender
 from experiments.planning_benchmark.grid_world import benchmark_robot, views_of
 from experiments.planning_benchmark.problems import Criteria, Problem, find_problems, tip_sphere
+from experiments.planning_benchmark.proposals import Proposals, find_goals
 from experiments.planning_benchmark.truth import PathTruth, Truth
 from experiments.protocols import TrueScene
 from experiments.stored import Stored
@@ -60,6 +61,9 @@ class Answer(Stored):
             the map can judge), "unsupported", "unobserved", "table"; empty without a hit.
         length: of the path in joint space, radians; NaN is None.
         travel: way of the finger tip, metres.
+        stated: probability that the path collides, by the contender's own posterior; None
+            without a path or a posterior.
+        clearance: of the path as its checker states it, metres; None without a path.
     """
 
     number: int
@@ -72,6 +76,8 @@ class Answer(Stored):
     known: str
     length: float | None
     travel: float | None
+    stated: float | None = None
+    clearance: float | None = None
 
     @property
     def solved(self) -> bool:
@@ -105,9 +111,13 @@ def _bench(kind: str, seed: int, data: str | None) -> Bench:
 def problem_case(case: Case) -> dict[str, Any]:
     """Find the problems of one scene: a task for `sweep`."""
     asked = case.asked
-    truth = _truth(asked["kind"], asked["seed"], case.given.get("data"))
-    criteria = Criteria.from_dict(asked["criteria"])
-    problems = find_problems(truth, asked["count"], asked["seed"], criteria)
+    scene = asked["kind"], asked["seed"], case.given.get("data")
+    truth, count, seed = _truth(*scene), asked["count"], asked["seed"]
+    if "proposals" in asked:
+        how = Proposals.from_dict(asked["proposals"])
+        problems = find_goals(truth, _bench(*scene), count, seed, how)
+    else:
+        problems = find_problems(truth, count, seed, Criteria.from_dict(asked["criteria"]))
     return {
         "scene": truth.scene.name,
         "objects": len(truth.scene.object_ids),
@@ -124,10 +134,8 @@ def answer_case(case: Case) -> dict[str, Any]:
     contender = Contender.from_dict(asked["contender"])
     checkers, build = bench.checkers(contender)
     limits = Limits(**asked["limits"])
-    answers = [
-        ask(checkers, Problem.from_dict(problem), truth, bench, limits)
-        for problem in asked["problems"]
-    ]
+    problems = [Problem.from_dict(problem) for problem in asked["problems"]]
+    answers = [ask(contender, checkers, one, truth, bench, limits) for one in problems]
     return {
         "contender": contender.key,
         "kind": asked["kind"],
@@ -136,14 +144,18 @@ def answer_case(case: Case) -> dict[str, Any]:
         "build": build,
         "commit": commit(),
         "answers": [answer.to_dict() for answer in answers],
+        "reachable": [list(problem.reachable) for problem in problems],
     }
 
 
 def ask(
-    checkers: Sequence[Any], problem: Problem, truth: Truth, bench: Bench, limits: Limits
-) -> Answer:
+    contender: Contender, checkers: Sequence[Any], problem: Problem, truth: Truth, bench: Bench,
+    limits: Limits,
+) -> Answer:  # fmt: skip
     """Ask a planner one problem with a checker, or with several in turn until one succeeds,
     and judge what it returns."""
+    # Only who takes the package as it comes takes its margins.
+    own: dict[str, Any] = {} if contender.defaults else {"margins": None}
     began, worked = time.perf_counter(), time.process_time()
     searched = 0.0
     for checker in checkers:
@@ -156,13 +168,19 @@ def ask(
             seed=problem.seed,
             simplify_time=limits.simplify_time,
             clock="process",
+            **own,
         )
         searched += result.report.planning_time
         if result.solved:
             break
     seconds, processor = time.perf_counter() - began, time.process_time() - worked
-    judged, known, travel = None, "", None
+    judged, known, travel, stated, clearance = None, "", None, None, None
     if result.path is not None:
+        clearance = result.report.min_clearance
+        if contender.posterior:
+            risk = result.report.risk
+            risk = checkers[-1].collision_probability(result.path) if risk is None else risk
+            stated = float(risk.probability)
         judged = truth.judge(result.path)
         known = _known(judged, bench) if judged.collides else ""
         travel = tip_travel(truth, result.path)
@@ -177,6 +195,8 @@ def ask(
         known,
         None if result.path is None else result.report.path_length,
         travel,
+        stated,
+        clearance,
     )
 
 

@@ -38,6 +38,7 @@ from vprism_plan.world.visibility import background_points
 
 _OFF_TABLE = 0.015  # metres over the support from which unlabelled points are things
 _CELLS = 2  # cells per grid step that observed points mark
+_HIDDEN = 0.15  # metres around what was seen of the objects in which networks are asked
 OCTOMAP_OCCUPIED = 1
 
 
@@ -63,12 +64,13 @@ class Bench:
         self.seed = seed
         self.truth = truth
         self.seconds: dict[str, float] = {}
-        self._worlds: dict[tuple[str, str, float], Any] = {}
+        self._worlds: dict[str, Any] = {}
 
     def checkers(self, contender: Contender) -> tuple[list[Any], float]:
         """Return a contender's checkers, one per bound, and the processor seconds they took
         from the observation on, what others made before included."""
         name = f"world {contender.map} {contender.occluded} {contender.resolution:g}"
+        name += " by default" if contender.defaults else ""
         world = self._world(contender, name)
         began = time.process_time()
         made = [self._make(contender, world, *bound) for bound in contender.bounds]
@@ -81,15 +83,19 @@ class Bench:
             from experiments.planning_benchmark.fcl_checker import FclChecker
 
             return FclChecker(world, self.robot, contender.step, margin)
+        if contender.defaults:
+            return CollisionChecker(world, self.robot)
         # 256 worlds without a collision cannot show a risk below 0.0148.
         draws = 512 if risk is not None and risk < 0.015 else 256
         config = CheckerConfig(margin=margin, max_risk=risk, n_worlds=draws)
         return CollisionChecker(world, self.robot, config)
 
     def _world(self, contender: Contender, name: str) -> Any:
-        key = (contender.map, contender.occluded, contender.resolution)
-        if key not in self._worlds:
-            if contender.map in ("vprism", "sgd"):
+        if name not in self._worlds:
+            if contender.defaults:
+                map_ = self.vprism
+                make: Callable[[], Any] = lambda: World(map_)  # noqa: E731
+            elif contender.map in ("vprism", "sgd"):
                 map_ = self.vprism if contender.map == "vprism" else self.sgd
                 config = WorldConfig(
                     resolution=contender.resolution,
@@ -97,18 +103,20 @@ class Bench:
                     bounds=benchmark_bounds(self.observation),
                     lone_share=LONE,
                 )
-                make: Callable[[], Any] = lambda: World(map_, config)  # noqa: E731
+                make = lambda: World(map_, config)  # noqa: E731
             elif contender.map == "points":
                 make = self.point_world
             elif contender.map == "octomap":
                 tree = self.octomap
                 make = lambda: self.octomap_world(tree, contender.occluded)  # noqa: E731
+            elif contender.map in ("pointsdf", "network"):
+                make = lambda: self.completed_world(contender.map)  # noqa: E731
             elif contender.map == "truth" and self.truth is not None:
                 return self.truth
             else:
                 raise ConfigError(f"contender {contender.key!r} has no world here")
-            self._worlds[key] = self._timed(name, make)
-        return self._worlds[key]
+            self._worlds[name] = self._timed(name, make)
+        return self._worlds[name]
 
     def _timed(self, name: str, make: Callable[[], Any]) -> Any:
         began = time.process_time()
@@ -132,15 +140,38 @@ class Bench:
         fit = method("octomap").fit
         return self._timed("map octomap", lambda: fit(self.observation, self.seed))
 
-    def point_world(self) -> GridWorld:
+    def completed_world(self, key: str) -> GridWorld:
+        """Return the observed points, and the solids that a network makes of each object.
+
+        A 5 mm cell is inside where the method's occupancy at its corner reaches its level.
+        """
+        chosen, grid = method(key), benchmark_grid(self.observation)
+        found = chosen.fit(self.observation, self.seed)
+        points, labels = self.observation.points()
+        seen, step = points[labels > 0], grid.spacing / _CELLS
+        low, high = (
+            np.clip(np.round((corner - grid.origin) / step), 0, _CELLS * (np.array(grid.shape) - 1))
+            for corner in (seen.min(axis=0) - _HIDDEN, seen.max(axis=0) + _HIDDEN)
+        )
+        axes = [np.arange(a, b + 1, dtype=np.int64) for a, b in zip(low, high, strict=True)]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        nodes = nodes[
+            support_plane(self.observation).signed_distance(grid.origin + step * nodes) > 0
+        ]
+        occupied = 1.0 - found.predict_proba(grid.origin + step * nodes)[:, 0]
+        return self.point_world(nodes[occupied >= chosen.level])
+
+    def point_world(self, solid: Int[np.ndarray, "n 3"] | None = None) -> GridWorld:
         """Return the observed points off the table, each as large as the sensor is uncertain.
 
         A point marks the 5 mm cells within three standard deviations of the depth noise
         at its range, and at least half its pixel's width. Flying pixels are left out as
-        our map leaves them out. All else is free.
+        our map leaves them out. All else is free, but the cells around `solid` nodes.
         """
         grid = benchmark_grid(self.observation)
         lattice = empty_lattice(grid, _CELLS)
+        if solid is not None:
+            lattice.labels[tuple(solid.T)] = 1
         points, labels, depth = self._things()
         focal = min(self.observation.intrinsics[0, 0], self.observation.intrinsics[1, 1])
         half = np.maximum(3.0 * depth_sigma(depth), 0.5 * depth / focal)

@@ -3,12 +3,14 @@
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from inspect import signature
 from typing import Any
 
 from experiments.stored import Stored
 from vprism_plan.collision import CheckerConfig
 from vprism_plan.errors import ConfigError
 from vprism_plan.mapping import MapConfig
+from vprism_plan.planning import plan
 from vprism_plan.world import WorldConfig
 from vprism_plan.world.config import OccludedPolicy
 
@@ -24,7 +26,7 @@ class Contender(Stored):
         key: short name.
         label: name in tables and pictures.
         line: contenders of one line differ in one parameter only.
-        map: "vprism", "sgd", "points", "octomap" or "truth".
+        map: "vprism", "sgd", "points", "octomap", "pointsdf", "network" or "truth".
         occluded: what a world of ours, or of the point estimate, does with occluded space;
             of OctoMap: whether unknown voxels in the image are obstacles.
         bounds: (margin in metres, bound on the collision probability or None) to plan with.
@@ -33,6 +35,8 @@ class Contender(Stored):
         meshes: whether FCL judges extracted meshes.
         resolution: of a world of ours, metres.
         step: for FCL, motion between two configurations of an edge, metres.
+        defaults: whether world, checker and planner are whatever the package makes of a map
+            when nothing else is said; of the fields above only `map` counts then.
     """
 
     key: str
@@ -44,6 +48,7 @@ class Contender(Stored):
     meshes: bool = False
     resolution: float = 0.01
     step: float = 0.005
+    defaults: bool = False
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Contender":
@@ -56,6 +61,11 @@ class Contender(Stored):
         del data["label"], data["line"]
         return data
 
+    @property
+    def posterior(self) -> bool:
+        """Whether its checker can say how probable a collision of the bare robot is."""
+        return self.map == "vprism" and not self.meshes and self.bounds[-1][0] == 0.0
+
 
 def _ours() -> Iterable[Contender]:
     """Level sets with margins and bounds on risk, by what occluded space is taken for."""
@@ -65,7 +75,7 @@ def _ours() -> Iterable[Contender]:
         ("free", "", "hidden: the map decides"),
     )
     margins = {"occupied": (0,), "posterior": (0, 10), "free": (0, 5, 10, 20, 30)}
-    risks = {"occupied": (), "posterior": (0.05,), "free": (0.01, 0.05, 0.2, 0.5)}
+    risks = {"occupied": BOUNDS, "posterior": BOUNDS, "free": (0.01, *BOUNDS, 0.5)}
     for policy, short, words in policies:
         head = f"ours-{short}-" if short else "ours-"
         for mm in margins[policy]:
@@ -91,6 +101,7 @@ def _ours() -> Iterable[Contender]:
         )
 
 
+BOUNDS = (0.02, 0.05, 0.1, 0.2)  # on the collision probability, of every policy
 _LADDER = (0.02, 0.01, 0.005, 0.0)  # metres
 CONTENDERS: dict[str, Contender] = {
     entry.key: entry
@@ -113,8 +124,23 @@ CONTENDERS: dict[str, Contender] = {
             "occupied",
         ),
         Contender("sgd", "SGD point estimate", "sgd", "sgd"),
+        Contender("default", "ours as it comes", "default", "vprism", defaults=True),
+        Contender("pointsdf", "PointSDF", "pointsdf", "pointsdf"),
+        Contender("network", "shape network alone", "network", "network"),
     )
 }  # fmt: skip
+
+ASKED = (
+    "truth", "default",
+    *(f"ours-{short}{rule}" for short in ("", "beyond-", "all-")
+      for rule in ("m0", *(f"r{round(100 * risk):02d}" for risk in BOUNDS))),
+    "ours-widest", "fcl", "fcl-m10", "points", "octomap-free", "octomap-occupied", "sgd",
+    "pointsdf", "network",
+)  # fmt: skip
+# About vetted ends, where refusing is always wrong, these say little that is new.
+_ONLY_ASKED = {"ours-r02", "ours-r10", "ours-beyond-r02", "ours-beyond-r10", "ours-beyond-r20",
+               "pointsdf", "network"}  # fmt: skip
+VETTED = tuple(k for k in CONTENDERS if k not in _ONLY_ASKED and not k.startswith("ours-all-r"))
 
 
 def contenders(keys: Iterable[str] | None = None) -> tuple[Contender, ...]:
@@ -136,6 +162,9 @@ def settings(contender: Contender) -> dict[str, Any]:
     }
     if contender.map in ("vprism", "sgd"):
         own["map"] = asdict(MapConfig())
+    if contender.defaults:
+        parameters = signature(plan).parameters.items()
+        own["plan"] = {name: repr(parameter.default) for name, parameter in parameters}
     return own
 
 

@@ -32,7 +32,7 @@ class FclChecker(MeshChecker):
     def __init__(
         self, world: World, robot: Robot, step: float = 0.005, margin: float = 0.0
     ) -> None:
-        config = CheckerConfig(margin=margin)
+        config = CheckerConfig(margin=margin, max_risk=None)
         super().__init__(world, robot, config, links="spheres", step=step, seen=False)
         self._made = partial(FclChecker, world, robot, step, margin)
         self._field = CollisionChecker(world, robot, config)

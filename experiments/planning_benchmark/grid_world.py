@@ -113,7 +113,7 @@ def world_of_distances(
     """Put a world together from a field and the support plane (the observation's if None)."""
     plane = support_plane(observation) if plane is None else plane
     rows = np.array([[*plane.normal, plane.offset]], dtype=np.float64)
-    config = WorldConfig(resolution=field.spacing)
+    config = WorldConfig(resolution=field.spacing, occluded="free")
     return GridWorld(field, rows, ("support surface",), views_of(observation), config)
 
 
@@ -135,7 +135,7 @@ def world_of_lattice(
 
 def checker_of(world: GridWorld, robot: Robot, margin: float = 0.0) -> CollisionChecker:
     """Return the checker that keeps `margin` (m) from a world."""
-    return CollisionChecker(world, robot, CheckerConfig(margin=margin))
+    return CollisionChecker(world, robot, CheckerConfig(margin=margin, max_risk=None))
 
 
 def empty_lattice(grid: Grid, factor: int) -> Lattice:

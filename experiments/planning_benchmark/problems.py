@@ -61,7 +61,7 @@ class Criteria(Stored):
 
 @dataclass(frozen=True)
 class Problem(Stored):
-    """A query whose answer exists.
+    """A query; one of `find_problems` has an answer.
 
     Attributes:
         number: within its scene, from 0.
@@ -69,6 +69,8 @@ class Problem(Stored):
         hidden: whether the camera cannot see the finger tip at the start, at the goal.
         hand: distance of hand and fingers to the nearest object at both ends, metres.
         seed: for the planners that are to solve it.
+        reachable: where that was not a condition, whether a path exists in truth with each of
+            some clearances, in rising order (`Proposals.clearances`).
     """
 
     number: int
@@ -77,6 +79,7 @@ class Problem(Stored):
     hidden: tuple[bool, bool]
     hand: tuple[float, float]
     seed: int
+    reachable: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,10 @@ def _solvable(
             continue
         number = len(problems)
         own = int(np.random.default_rng([seed, number]).integers(2**31))
-        found = plan(spacious, a.q, b.q, time_limit=criteria.time_limit, seed=own, clock="process")
+        found = plan(
+            spacious, a.q, b.q, time_limit=criteria.time_limit, seed=own, clock="process",
+            margins=None,
+        )  # fmt: skip
         if not found.solved:
             continue
         open_left -= seen

@@ -5,14 +5,15 @@ results, files = benchmark(("ycb",), scenes=30, output=Path("docs/results"))
 """
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from experiments.planning_benchmark.asking import Limits
-from experiments.planning_benchmark.contenders import full_label
+from experiments.planning_benchmark.contenders import VETTED, full_label
 from experiments.planning_benchmark.ompl_log import write_log
 from experiments.planning_benchmark.problems import Criteria
+from experiments.planning_benchmark.proposals import Proposals
 from experiments.planning_benchmark.run import Found, run
 from experiments.planning_benchmark.summary import (
     DEEP,
@@ -22,6 +23,7 @@ from experiments.planning_benchmark.summary import (
     outcomes,
     statements,
 )
+from experiments.tables.sweep import SweepError
 from vprism_plan._files import write_text
 from vprism_plan.errors import ConfigError
 
@@ -58,20 +60,44 @@ def benchmark(
         ConfigError: fewer scenes than kinds; or as `run`.
         SweepError: some scenes failed; the report is written without them, and names them.
     """
-    chosen = None if checkers is None else tuple(checkers)
-    limits = Limits() if limits is None else limits
-    criteria = Criteria() if criteria is None else criteria
     if not kinds or scenes < len(kinds):
         raise ConfigError(
             f"scenes is {scenes} for {len(kinds)} sets ({', '.join(kinds)}); scenes are shared out "
             "among the sets, and each needs at least one"
         )
+    shares = {
+        kind: scenes // len(kinds) + (number < scenes % len(kinds))
+        for number, kind in enumerate(kinds)
+    }
+    answers, about, failures = collect(
+        shares, first_seed, checkers=VETTED if checkers is None else tuple(checkers), count=count,
+        criteria=Criteria() if criteria is None else criteria, limits=limits or Limits(),
+        store=store, data=data, command=command, **how,
+    )  # fmt: skip
+    figures, files = write_report(answers, about, output)
+    if failures:
+        raise failures[0]
+    return figures, files
+
+
+def collect(
+    shares: Mapping[str, int],
+    first_seed: int,
+    *,
+    checkers: Sequence[str],
+    criteria: Criteria | Proposals,
+    limits: Limits,
+    count: int,
+    data: Path | None,
+    command: str,
+    **how: Any,
+) -> tuple[list[dict[str, Any]], dict[str, Any], list[SweepError]]:
+    """Return the answers on a number of scenes of each kind, what was asked, and what failed."""
     found: dict[str, Found] = {}
-    for number, kind in enumerate(kinds):
-        own = scenes // len(kinds) + (number < scenes % len(kinds))
+    for kind, own in shares.items():
         found[kind] = run(
-            kind, own, first_seed, checkers=chosen, count=count, criteria=criteria,
-            limits=limits, store=store, data=data if kind in ("ycb", "folder") else None, **how,
+            kind, own, first_seed, checkers=checkers, count=count, criteria=criteria,
+            limits=limits, data=data if kind in ("ycb", "folder") else None, **how,
         )  # fmt: skip
     answers = [entry for own in found.values() for entry in own.answers]
     failures = [own.failed for own in found.values() if own.failed is not None]
@@ -88,10 +114,7 @@ def benchmark(
         "limits": vars(limits), "command": command,
         "commits": sorted({entry["commit"] for entry in answers}),
     }  # fmt: skip
-    figures, files = write_report(answers, about, output)
-    if failures:
-        raise failures[0]
-    return figures, files
+    return answers, about, failures
 
 
 def write_report(
@@ -144,7 +167,7 @@ def markdown(figures: dict[str, Any], found: Sequence[Outcome]) -> str:
         "by the true scene. Reprint with", "",
         f"    {about['command']}", "",
         f'Computed at {", ".join(about["commits"])} ("+": with uncommitted changes).', "",
-        *_exceptions(about),
+        *exceptions(about),
         "## What holds", "",
         *[f"- {_sentence(s)}" for s in statements(found)], "",
         f"![Success against true collisions]({KEY}.png)", "",
@@ -155,7 +178,7 @@ def markdown(figures: dict[str, Any], found: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
-def _exceptions(about: dict[str, Any]) -> list[str]:
+def exceptions(about: dict[str, Any]) -> list[str]:
     """Which scenes are not those that the seeds say, and why."""
     lines = []
     short = [
@@ -193,7 +216,8 @@ def _sentence(s: Statement) -> str:
     )
 
 
-def _percent(figure: dict[str, float | None]) -> str:
+def percent(figure: dict[str, float | None]) -> str:
+    """Return a share, and its interval if it has one, in percent."""
     if figure["value"] is None:
         return "-"
     text = f"{100 * figure['value']:.1f}"
@@ -216,8 +240,8 @@ def _table(figures: dict[str, Any], found: Sequence[Outcome]) -> list[str]:
             "-" if row[name] is None else f"{row[name]:.2f}" for name in ("length", "travel")
         )
         lines.append(
-            f"| {full_label(outcome.contender)} | {_percent(row['success'])} "
-            f"| {_percent(row['collision'])} | {_percent(row['deep'])} | {_percent(row['safe'])} "
+            f"| {full_label(outcome.contender)} | {percent(row['success'])} "
+            f"| {percent(row['collision'])} | {percent(row['deep'])} | {percent(row['safe'])} "
             f"| {1000 * row['mean_depth']:.1f}, {1000 * row['worst_depth']:.0f} "
             f"| {length} | {travel} "
             f"| {row['seconds_median']:.2f}, {row['seconds_95']:.2f} | {row['build']:.1f} |"

@@ -15,13 +15,14 @@ from typing import Any
 from experiments.planning_benchmark.asking import Answer, Limits, answer_case, problem_case
 from experiments.planning_benchmark.contenders import contenders, settings
 from experiments.planning_benchmark.problems import Criteria
+from experiments.planning_benchmark.proposals import Proposals
 from experiments.tables import scoring
 from experiments.tables.sweep import Case, SweepError, sweep, sweep_complete
 from vprism_plan.errors import ConfigError
 
 # Of what an answer means, part of every question: raised by hand whenever the robot, the
 # planner, a world, a checker or the scenes change what they answer to the same settings.
-VERSION = 4
+VERSION = 5
 _SPARE = 2  # times the scenes that are asked for: where seeds end if too many offer too little
 
 
@@ -48,7 +49,7 @@ def run(
     *,
     checkers: Iterable[str] | None = None,
     count: int = 20,
-    criteria: Criteria | None = None,
+    criteria: Criteria | Proposals | None = None,
     limits: Limits | None = None,
     store: Path = Path("build/evaluation/planning"),
     data: Path | None = None,
@@ -64,6 +65,7 @@ def run(
         scenes: how many; seeds from first_seed on, but those that offer too few problems.
         checkers: keys of `CONTENDERS`; all if None.
         count: problems per scene.
+        criteria: which problems: with vetted ends, or proposed from the image.
 
     Raises:
         ConfigError: an unknown contender, no scene or problem asked for, or too few scenes
@@ -75,7 +77,9 @@ def run(
     chosen = contenders(checkers)
     about = {"version": VERSION, "kind": kind, "data": scoring.data_digest(kind, data)}
     given = scoring.whereabouts(kind, data)
-    asked = {"count": count, "criteria": (Criteria() if criteria is None else criteria).to_dict()}
+    criteria = Criteria() if criteria is None else criteria
+    name = "proposals" if isinstance(criteria, Proposals) else "criteria"
+    asked = {"count": count, name: criteria.to_dict()}
     problems, replaced = _problems(
         {**about, **asked}, given, scenes, first_seed, Path(store) / "problems", how
     )

@@ -22,7 +22,12 @@ def checkout(tmp_path, monkeypatch):
     results.mkdir(parents=True)
     sets = {"sets": {kind: {"scenes": 4} for kind in ("analytic", "ycb", "random")}}
     planning = {"about": {"kinds": {"analytic": 4, "ycb": 4, "random": 4}}}
-    for table, page in (("baselines", sets), ("uncertainty", sets), ("planning", planning)):
+    for table, page in (
+        ("baselines", sets),
+        ("uncertainty", sets),
+        ("planning", planning),
+        ("asked", planning),
+    ):
         (results / f"{table}.json").write_text(json.dumps(page))
     monkeypatch.setattr(command, "__file__", str(tmp_path / "experiments" / "__main__.py"))
     return results
@@ -35,6 +40,7 @@ def checkout(tmp_path, monkeypatch):
         (["baselines", "--set", "analytic", "--scenes", "11"], 11),
         (["uncertainty", "--scenes", "1"], 3),
         (["planning", "--scenes", "11"], 11),
+        (["asked", "--scenes", "3"], 9),
     ],
 )
 def test_a_short_run_replaced_the_page_of_a_long_one(words, scenes, checkout, capsys):
@@ -86,7 +92,7 @@ def test_the_printed_command_named_part_of_a_path(tmp_path):
 
 
 @pytest.mark.parametrize("where", ["--store", "--output"])
-@pytest.mark.parametrize("table", ["baselines", "uncertainty", "planning"])
+@pytest.mark.parametrize("table", ["baselines", "uncertainty", "planning", "asked"])
 def test_a_folder_that_cannot_be_written_was_found_after_the_work(
     where, table, tmp_path, capsys, monkeypatch
 ):
