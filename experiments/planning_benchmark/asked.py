@@ -19,7 +19,7 @@ from experiments.planning_benchmark.asking import Answer, Limits
 from experiments.planning_benchmark.contenders import ASKED, CONTENDERS, full_label
 from experiments.planning_benchmark.proposals import Proposals
 from experiments.planning_benchmark.report import collect, exceptions, percent
-from experiments.planning_benchmark.summary import Outcome, estimate, outcomes
+from experiments.planning_benchmark.summary import OURS, REFERENCE, Outcome, estimate, outcomes
 from experiments.tables.intervals import Statistic, difference, over_scenes, ratio
 from vprism_plan._files import write_text
 from vprism_plan.collision import CheckerConfig
@@ -32,8 +32,6 @@ KEY = "asked"
 COSTS = (3, 10, 30, 100)  # of a collision, in reached goals
 COVERAGES = (0.2, 0.4, 0.6)  # shares of the goals at which the curves are read
 UNBOUND = "ours-m0"  # its paths are selected by no probability: what calibration is read from
-_OTHERS = ("fcl", "fcl-m10", "points", "octomap-free", "octomap-occupied", "sgd", "pointsdf",
-           "network")  # fmt: skip
 
 
 def benchmark(
@@ -185,7 +183,7 @@ def summary(found: Sequence[dict[str, Any]], about: dict[str, Any]) -> dict[str,
     by_key = {o.contender.key: o for o in everyone}
     rows = {key: row(o, reached) for key, o in by_key.items()}
     ours = [o for o in everyone if any(a.stated is not None for a in o.all)]
-    others = [key for key in _OTHERS if key in rows]
+    others = [key for key in rows if not key.startswith((OURS, "default", REFERENCE))]
     against = {}
     if "default" in rows and others:
         for cost in COSTS:
@@ -221,57 +219,41 @@ def write_report(
 
 # --- picture --------------------------------------------------------------------------
 
-_FAMILIES = {  # line in the picture: its contenders, colour, marker
-    "ours as it comes": (("default",), "#000000", "*"),
-    "ours, bound on risk (hidden: the map decides)":
-        (tuple(f"ours-r{n}" for n in ("02", "05", "10", "20")), "#1b6ca8", "o"),
-    "ours, bound on risk (hidden: obstacle beyond support)":
-        (tuple(f"ours-beyond-r{n}" for n in ("02", "05", "10", "20")), "#2a9d5c", "o"),
-    "ours, bound on risk (hidden: obstacle)":
-        (tuple(f"ours-all-r{n}" for n in ("02", "05", "10", "20")), "#7b4ea3", "o"),
-    "ours, level set": (("ours-m0",), "#0f8b8d", "o"),
-    "ours, widest margin": (("ours-widest",), "#5b6b2f", "o"),
-    "meshes with FCL": (("fcl",), "#b3261e", "s"),
-    "meshes with FCL, 10 mm": (("fcl-m10",), "#e5736b", "s"),
-    "point cloud": (("points",), "#6b4c3b", "v"),
-    "OctoMap, unknown free": (("octomap-free",), "#d9822b", "^"),
-    "OctoMap, unknown occupied": (("octomap-occupied",), "#777777", "P"),
-    "SGD point estimate": (("sgd",), "#c2185b", "D"),
-    "PointSDF": (("pointsdf",), "#8c564b", "X"),
-    "shape network alone": (("network",), "#e377c2", "d"),
-}  # fmt: skip
-
 
 def picture(figures: dict[str, Any], everyone: Sequence[Outcome]) -> "Figure":
     """Draw utility over the cost of a collision, and collisions over what is answered.
 
     Of several bounds that one is drawn that suits the cost, 1 / (1 + c); 0.1 in the curves.
     """
+    from experiments.planning_benchmark.pictures import style
     from vprism_plan.viz._figures import new_figure
 
-    figure = new_figure(13.0, 6.4)
+    figure = new_figure(13.0, 7.0)
     left, right = figure.subplots(1, 2)
     by_key, rows = {o.contender.key: o for o in everyone}, figures["contenders"]
-    shown = {name: own for name, own in _FAMILIES.items() if any(k in rows for k in own[0])}
-    for number, (name, (keys, color, marker)) in enumerate(shown.items()):
-        there = [key for key in keys if key in rows]
-        chosen = [rows[_suiting(there, cost)][f"utility {cost}"] for cost in COSTS]
+    lines: dict[str, list[str]] = {}
+    for c in (CONTENDERS[key] for key in rows):
+        lines.setdefault(c.line if c.bounds[-1][1] else full_label(c), []).append(c.key)
+    ours = [name for name, keys in lines.items() if keys[0].startswith(OURS)]
+    for number, (name, keys) in enumerate(lines.items()):
+        color, marker = style(keys[0], ours.index(name) if name in ours else 0)
+        chosen = [rows[_suiting(keys, cost)][f"utility {cost}"] for cost in COSTS]
         middle, low, high = (
-            np.array([one[end] if one[end] is not None else one["value"] for one in chosen])
+            np.array([one["value"] if one[end] is None else one[end] for one in chosen])
             for end in ("value", "low", "high")
         )
-        x = np.arange(len(COSTS)) + 0.7 * ((number + 0.5) / len(shown) - 0.5)
+        x = np.arange(len(COSTS)) + 0.7 * ((number + 0.5) / len(lines) - 0.5)
         left.errorbar(x, middle, np.abs([middle - low, high - middle]), color=color, marker=marker,
-                      linewidth=0.8, elinewidth=1.0, markersize=5.0, label=name)  # fmt: skip
-        key = _suiting(there, 9)
+                      linewidth=0.6, elinewidth=1.0, markersize=5.0, label=name)  # fmt: skip
+        key = _suiting(keys, 9)
         curve = risk_curve(*risks(by_key[key].all))
-        share = np.arange(1, len(curve) + 1) / rows[key]["asked"]
-        right.plot(100.0 * share, 100.0 * curve, color=color, linewidth=1.5)
-        right.plot(100.0 * share[-1:], 100.0 * curve[-1:], color=color, marker=marker)
+        share = 100.0 * np.arange(1, len(curve) + 1) / rows[key]["asked"]
+        right.plot(
+            share, 100.0 * curve, color=color, marker=marker, markevery=[-1] * len(curve[:1])
+        )
     left.axhline(0.0, color="#000000", linewidth=0.8)
     left.set_yscale("symlog", linthresh=1.0)
-    left.set_yticks([1, 0.5, 0, -0.5, -1, -3, -10, -30], ["1", "0.5", "0", "-0.5", "-1", "-3",
-                    "-10", "-30"])  # fmt: skip
+    left.yaxis.set_major_formatter("{x:g}")
     left.set_xticks(range(len(COSTS)), [str(cost) for cost in COSTS])
     left.set_xlabel("cost c of a collision, in reached goals")
     left.set_ylabel("utility (clean - c collides) / asked")

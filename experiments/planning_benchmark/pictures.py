@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 _COLORS = ("#1b6ca8", "#2a9d5c", "#7b4ea3", "#c27c0e", "#0f8b8d", "#5b6b2f", "#8c564b", "#e377c2")
 _OTHERS = {
     "fcl": ("#b3261e", "s"), "fcl-fine": ("#e5736b", "s"), "points": ("#6b4c3b", "v"),
-    "octomap-free": ("#d9822b", "^"),
+    "octomap-free": ("#d9822b", "^"), "fcl-m10": ("#e5736b", "s"), "default": ("#000000", "p"),
+    "pointsdf": ("#e8a33d", "X"), "network": ("#9aa5b1", "d"),
     "octomap-occupied": ("#444444", "P"), "sgd": ("#c2185b", "D"), "truth": ("#000000", "*"),
 }  # fmt: skip
 # What became of a problem: colour and word, from good to bad.
@@ -38,10 +39,7 @@ def curve_figure(found: Sequence[Outcome]) -> "Figure":
         lines.setdefault(outcome.contender.line, []).append(outcome)
     ours = [line for line, own in lines.items() if own[0].contender.key.startswith(OURS)]
     for line, own in lines.items():
-        if line in ours:
-            color, marker = _COLORS[ours.index(line) % len(_COLORS)], "o"
-        else:
-            color, marker = _OTHERS.get(own[0].contender.key, ("#555555", "x"))
+        color, marker = style(own[0].contender.key, ours.index(line) if line in ours else 0)
         _line(axes, words[line], own, color, marker)
     _hull(axes, [own for line in ours for own in lines[line]])
     axes.set_xlabel("returned paths that truly collide (%)")
@@ -74,6 +72,13 @@ def _line(axes: "Axes", line: str, own: list[Outcome], color: str, marker: str) 
                 outcome.contender.label, (a, b), xytext=(5, -9), textcoords="offset points",
                 fontsize=7, color=color,
             )  # fmt: skip
+
+
+def style(key: str, number: int) -> tuple[str, str]:
+    """Return colour and marker of a contender's line; of ours by its number among them."""
+    if key.startswith(OURS):
+        return _COLORS[number % len(_COLORS)], "o"
+    return _OTHERS.get(key, ("#555555", "x"))
 
 
 def _words(outcome: Outcome) -> str:

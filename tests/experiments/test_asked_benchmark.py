@@ -183,9 +183,9 @@ def test_who_has_a_posterior_states_a_probability(bench, truth, goals, monkeypat
     _, answer, _ = asked_of(monkeypatch, bench, truth, goals[answer.number], "points")
     assert (answer.solved, answer.stated) == (True, None)
     assert answer.clearance >= 0.0
-    assert [key for key in ASKED if not CONTENDERS[key].posterior] == [
-        "truth", *(k for k in asked._OTHERS if k in ASKED),
-    ]  # fmt: skip
+    silent = [key for key in ASKED if not CONTENDERS[key].posterior]
+    assert not [key for key in silent if key.startswith(("ours", "default"))]
+    assert {"fcl", "sgd", "truth"} <= set(silent)
 
 
 def test_vetted_ends_are_asked_of_whom_they_were_before():
