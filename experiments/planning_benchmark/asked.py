@@ -15,10 +15,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from experiments.metrics import Reliability
-from experiments.planning_benchmark.asking import Answer, Limits
+from experiments.planning_benchmark import report
+from experiments.planning_benchmark.asking import Answer
 from experiments.planning_benchmark.contenders import ASKED, CONTENDERS, full_label
 from experiments.planning_benchmark.proposals import Proposals
-from experiments.planning_benchmark.report import collect, exceptions, percent
+from experiments.planning_benchmark.report import exceptions, percent
 from experiments.planning_benchmark.summary import OURS, REFERENCE, Outcome, estimate, outcomes
 from experiments.tables.intervals import Statistic, difference, over_scenes, ratio
 from vprism_plan._files import write_text
@@ -37,34 +38,20 @@ UNBOUND = "ours-m0"  # its paths are selected by no probability: what calibratio
 def benchmark(
     kinds: Sequence[str] = ("analytic", "ycb", "random"),
     scenes: int = 30,
-    first_seed: int = 1000,
     *,
-    output: Path,
     checkers: Iterable[str] | None = None,
     count: int = 30,
-    proposals: Proposals | None = None,
-    limits: Limits | None = None,
-    data: Path | None = None,
-    command: str = "",
+    criteria: Proposals | None = None,
     **how: Any,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run on `scenes` scenes of each kind and write asked.md, .json and .png.
 
-    Returns the figures, ready for JSON, and the files. Other arguments are those of `run`.
-
-    Raises:
-        ConfigError: as `run`.
-        SweepError: some scenes failed; the report is written without them, and names them.
+    Other arguments, results and errors are those of the vetted benchmark.
     """
-    answers, about, failures = collect(
-        dict.fromkeys(kinds, scenes), first_seed, count=count, data=data, command=command,
-        checkers=ASKED if checkers is None else tuple(checkers), limits=limits or Limits(),
-        criteria=proposals or Proposals(), **how,
+    return report.benchmark(
+        kinds, scenes * len(kinds), checkers=ASKED if checkers is None else checkers, count=count,
+        criteria=criteria or Proposals(), write=write_report, **how,
     )  # fmt: skip
-    figures, files = write_report(answers, about, output)
-    if failures:
-        raise failures[0]
-    return figures, files
 
 
 # --- figures --------------------------------------------------------------------------
@@ -253,7 +240,8 @@ def picture(figures: dict[str, Any], everyone: Sequence[Outcome]) -> "Figure":
         )
     left.axhline(0.0, color="#000000", linewidth=0.8)
     left.set_yscale("symlog", linthresh=1.0)
-    left.yaxis.set_major_formatter("{x:g}")
+    ticks = (1, 0.5, 0, -0.5, -1, -3, -10, -30)
+    left.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     left.set_xticks(range(len(COSTS)), [str(cost) for cost in COSTS])
     left.set_xlabel("cost c of a collision, in reached goals")
     left.set_ylabel("utility (clean - c collides) / asked")
@@ -341,7 +329,12 @@ def _points(figures: dict[str, Any]) -> list[str]:
                 f"- Stated probability of {words}: {100 * own['predicted']:.1f} % on average, "
                 f"{100 * own['observed']:.1f} % collide; expected calibration error "
                 f"{own['ece']:.3f} over {own['paths']} paths, {own['between']} of them between "
-                "0.1 and 0.9."
+                "0.1 and 0.9. Stated, and observed: "
+                + "; ".join(
+                    f"{100 * b['predicted']:.0f} %, {100 * b['observed']:.0f} % of {b['count']}"
+                    for b in own["bins"]
+                )
+                + "."
             )
     return lines
 
@@ -349,32 +342,30 @@ def _points(figures: dict[str, Any]) -> list[str]:
 def _explanation(about: dict[str, Any]) -> list[str]:
     """What was asked, and what the columns mean."""
     c, limits = about["criteria"], about["limits"]
+    near, far = (1000 * metres for metres in c["behind"])
     return [
         "## What is asked", "",
-        f"- **Goals**: {about['count']} a scene. The finger tip lies {1000 * c['behind'][0]:.0f} "
-        f"to {1000 * c['behind'][1]:.0f} mm behind a seen point of an object, along its ray. The "
-        f"hand leans at most {math.degrees(c['tilt']):.0f} degrees from straight down. The robot "
-        f"keeps {1000 * c['clear']:g} mm from all that was seen and from the support (flying "
-        "pixels left out). Nobody has looked at the truth.",
+        f"- **Goals**: {about['count']} a scene. The finger tip lies {near:.0f} to {far:.0f} mm "
+        "behind a seen point of an object, along its ray. The hand leans at most "
+        f"{math.degrees(c['tilt']):.0f} degrees from straight down. The robot keeps "
+        f"{1000 * c['clear']:g} mm from all that was seen (flying pixels left out) and from the "
+        "support. Nobody has looked at the truth.",
         "- **Start**: one fixed configuration of the arm, clear of everything in truth.",
         f"- **Planner**: {limits['planner']}, {limits['time_limit']:g} s of processor time, then "
         f"at most {limits['simplify_time']:g} s of shortening; the same seed for everybody.",
-        "- **Outcome**: clean, collides (any penetration in truth), or refused. A refusal is "
-        f"impossible if the truth has no path, in {c['time_limit']:g} s, and nobody found a clean "
-        "one.",
-        "- **U(c)**: (clean - c collides) / asked. Who refuses everything gets 0.",
-        "- **area**: answers are ranked by what the contender states: its probability of a "
-        "collision, or else its clearance. The mean share of collisions over all ranks; less is "
-        "better. **first 20 %**: collisions among the best ranked answers, as many as 20 % of the "
-        "goals.",
-        "- **Stated probability**: of the whole path. With a bound it is the planner's verdict, "
-        "by worlds that the search has not seen.",
-        "- **ours as it comes**: `World(map)`, `CheckerConfig()` and `plan()` by default. The "
-        "others are those of the vetted benchmark. **PointSDF**, **shape network alone**: their "
-        "solids and the seen points.",
-        "- **Tuned on**: seeds 0 to 99. Of the objects, those of `random` were never tuned on; "
-        "`ycb` and `analytic` are held out by scene. PointSDF and the shape network were trained "
-        "on other generated scenes.", "",
+        "- **Refused**: no path. Impossible: the truth has none, within "
+        f"{c['time_limit']:g} s, and nobody found a clean one. **U(c)**: (clean - c collides) / "
+        "asked; who refuses everything gets 0.",
+        "- **area**: answers are ranked by what their checker states: the probability of a "
+        "collision, or else the clearance. The mean share of collisions over all ranks; less is "
+        "better. **first 20 %**: that share when the best ranked answer 20 % of the goals.",
+        "- **Stated probability**: of the whole path. With a bound, by worlds that the search has "
+        "not seen.",
+        "- **ours as it comes**: `World(map)`, `CheckerConfig()` and `plan()` with their defaults. "
+        "**PointSDF**, **shape network alone**: their solids and the seen points. The others are "
+        "those of the vetted benchmark.",
+        "- **Tuned on**: seeds 0 to 99. Objects of `random` were never tuned on; `ycb` and "
+        "`analytic` are held out by scene. Both networks were trained on other scenes.", "",
         "Brackets: 95 % bootstrap intervals over scenes. Query: processor time, mean. Map: from "
         "the image to a checker that answers.", "",
     ]  # fmt: skip

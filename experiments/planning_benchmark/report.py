@@ -5,7 +5,7 @@ results, files = benchmark(("ycb",), scenes=30, output=Path("docs/results"))
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from experiments.planning_benchmark.summary import (
     outcomes,
     statements,
 )
-from experiments.tables.sweep import SweepError
 from vprism_plan._files import write_text
 from vprism_plan.errors import ConfigError
 
@@ -36,6 +35,10 @@ _KNOWN = {
     "table": "the table",
 }
 
+Write = Callable[
+    [Sequence[dict[str, Any]], dict[str, Any], Path], tuple[dict[str, Any], list[Path]]
+]
+
 
 def benchmark(
     kinds: Sequence[str] = ("analytic", "ycb", "random"),
@@ -46,58 +49,36 @@ def benchmark(
     store: Path,
     checkers: Iterable[str] | None = None,
     count: int = 20,
-    criteria: Criteria | None = None,
+    criteria: Criteria | Proposals | None = None,
     limits: Limits | None = None,
     data: Path | None = None,
+    write: Write | None = None,
     command: str = "",
     **how: Any,
 ) -> tuple[dict[str, Any], list[Path]]:
     """Run the benchmark on `scenes` scenes in all, shared out among the kinds, and write it.
 
-    Returns the figures, ready for JSON, and the files. Other arguments are those of `run`.
+    Returns the figures, ready for JSON, and the files, as `write` does with answers, what was
+    asked, and the folder; `write_report` if None. Other arguments are those of `run`.
 
     Raises:
         ConfigError: fewer scenes than kinds; or as `run`.
         SweepError: some scenes failed; the report is written without them, and names them.
     """
+    chosen = VETTED if checkers is None else tuple(checkers)
+    limits = Limits() if limits is None else limits
+    criteria = Criteria() if criteria is None else criteria
     if not kinds or scenes < len(kinds):
         raise ConfigError(
             f"scenes is {scenes} for {len(kinds)} sets ({', '.join(kinds)}); scenes are shared out "
             "among the sets, and each needs at least one"
         )
-    shares = {
-        kind: scenes // len(kinds) + (number < scenes % len(kinds))
-        for number, kind in enumerate(kinds)
-    }
-    answers, about, failures = collect(
-        shares, first_seed, checkers=VETTED if checkers is None else tuple(checkers), count=count,
-        criteria=Criteria() if criteria is None else criteria, limits=limits or Limits(),
-        store=store, data=data, command=command, **how,
-    )  # fmt: skip
-    figures, files = write_report(answers, about, output)
-    if failures:
-        raise failures[0]
-    return figures, files
-
-
-def collect(
-    shares: Mapping[str, int],
-    first_seed: int,
-    *,
-    checkers: Sequence[str],
-    criteria: Criteria | Proposals,
-    limits: Limits,
-    count: int,
-    data: Path | None,
-    command: str,
-    **how: Any,
-) -> tuple[list[dict[str, Any]], dict[str, Any], list[SweepError]]:
-    """Return the answers on a number of scenes of each kind, what was asked, and what failed."""
     found: dict[str, Found] = {}
-    for kind, own in shares.items():
+    for number, kind in enumerate(kinds):
+        own = scenes // len(kinds) + (number < scenes % len(kinds))
         found[kind] = run(
-            kind, own, first_seed, checkers=checkers, count=count, criteria=criteria,
-            limits=limits, data=data if kind in ("ycb", "folder") else None, **how,
+            kind, own, first_seed, checkers=chosen, count=count, criteria=criteria,
+            limits=limits, store=store, data=data if kind in ("ycb", "folder") else None, **how,
         )  # fmt: skip
     answers = [entry for own in found.values() for entry in own.answers]
     failures = [own.failed for own in found.values() if own.failed is not None]
@@ -114,7 +95,10 @@ def collect(
         "limits": vars(limits), "command": command,
         "commits": sorted({entry["commit"] for entry in answers}),
     }  # fmt: skip
-    return answers, about, failures
+    figures, files = (write or write_report)(answers, about, output)
+    if failures:
+        raise failures[0]
+    return figures, files
 
 
 def write_report(

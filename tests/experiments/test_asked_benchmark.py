@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Goals from the image: how they are proposed, and what answers to them are worth."""
 
+import importlib
 import json
 from itertools import pairwise, permutations
 from types import SimpleNamespace
@@ -13,12 +14,14 @@ from oracles.small_scenes import at, small_config, small_scene
 
 from experiments.planning_benchmark import (
     Answer,
+    Found,
     PathTruth,
     Problem,
     Truth,
     asked,
     asking,
     checkers,
+    report,
 )
 from experiments.planning_benchmark.checkers import Bench
 from experiments.planning_benchmark.contenders import ASKED, CONTENDERS, VETTED
@@ -40,6 +43,7 @@ from vprism_plan.simulation.scenes import Scene
 from vprism_plan.simulation.solids import Box
 
 HOW = Proposals()
+running = importlib.import_module("experiments.planning_benchmark.run")
 
 
 @pytest.fixture(scope="module")
@@ -368,3 +372,39 @@ def test_the_page_says_what_the_figures_say(tmp_path):
         assert gain["best"] in ("points", "fcl-m10")
     assert figures["against"]["3"]["best"] == ("points", "fcl-m10")[int(np.argmax(worth))]
     assert "points solids 9: no" in text
+
+
+def test_every_kind_gets_all_scenes_and_goals_from_the_image(tmp_path, monkeypatch):
+    told = []
+
+    def run(kind, scenes, first_seed, **how):
+        told.append((kind, scenes, first_seed, how["checkers"], how["count"], how["criteria"]))
+        found = answered([[(0.01, 0.0, 0.01)]] * scenes)
+        return Found([{**entry, "kind": kind} for entry in found], {})
+
+    monkeypatch.setattr(report, "run", run)
+    figures, files = asked.benchmark(
+        ("ycb", "random"), 2, first_seed=7, output=tmp_path, store=tmp_path / "s"
+    )
+    assert told == [(kind, 2, 7, ASKED, 30, HOW) for kind in ("ycb", "random")]
+    assert figures["about"]["kinds"] == {"ycb": 2, "random": 2}
+    assert len(files) == 3
+
+
+def test_goals_and_vetted_ends_are_different_questions(tmp_path, monkeypatch):
+    """They share a store; the criteria tell them apart, and a task knows what to find."""
+    cases = []
+
+    def sweep(task, given, store, **how):
+        cases.extend(given)
+        return [{"problems": [{}] * 2} for _ in given]
+
+    monkeypatch.setattr(running, "sweep", sweep)
+    for criteria in (None, HOW):
+        how = {} if criteria is None else {"criteria": criteria}
+        monkeypatch.setattr(running, "sweep_complete", lambda *_, **__: ([], [], None))
+        running.run("solids", 1, 7, checkers=["truth"], count=2, store=tmp_path, **how)
+    vetted, proposed = cases
+    assert ("criteria" in vetted.asked, "proposals" in vetted.asked) == (True, False)
+    assert ("criteria" in proposed.asked, "proposals" in proposed.asked) == (False, True)
+    assert Proposals.from_dict(json.loads(json.dumps(proposed.asked["proposals"]))) == HOW
