@@ -31,6 +31,7 @@ from experiments.planning_benchmark.proposals import (
     HOMES,
     Proposals,
     find_goals,
+    hand_rotations,
     propose,
     tip_places,
 )
@@ -111,6 +112,18 @@ def test_hands_point_down_and_keep_clear_of_what_was_seen(goals, bench, scene):
         assert (centers[:, 2] - radii).min() >= HOW.clear - 0.003  # the fitted plane is not z = 0
         axis = robot.link_poses(q)["panda_hand"][:3, 2]
         assert np.arccos(-axis[2]) <= HOW.tilt + 0.03
+
+
+def test_hands_lean_every_way_up_to_their_tilt():
+    R = hand_rotations(np.random.default_rng(0), 0.7, 2000)
+    unit = np.broadcast_to(np.eye(3), R.shape)
+    np.testing.assert_allclose(R @ R.transpose(0, 2, 1), unit, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(R), 1.0)
+    lean = np.arccos(-R[:, 2, 2])
+    assert 0.69 < lean.max() <= 0.7 + 1e-12
+    assert lean.min() < 0.01
+    for x, y in (R[:, :2, 2].T, R[:, :2, 0].T):  # where the axis leans to, how the hand is turned
+        assert (np.histogram(np.arctan2(y, x), 8, (-np.pi, np.pi))[0] > 180).all()
 
 
 def test_nobody_looks_at_the_truth_to_propose(bench, scene, truth, goals):
