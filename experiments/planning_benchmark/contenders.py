@@ -6,7 +6,9 @@ from dataclasses import asdict, dataclass
 from inspect import signature
 from typing import Any
 
+from experiments.baselines import METHODS
 from experiments.stored import Stored
+from experiments.tables.scoring import method_question
 from vprism_plan.collision import CheckerConfig
 from vprism_plan.errors import ConfigError
 from vprism_plan.mapping import MapConfig
@@ -162,6 +164,8 @@ def settings(contender: Contender) -> dict[str, Any]:
     }
     if contender.map in ("vprism", "sgd"):
         own["map"] = asdict(MapConfig())
+    if contender.map in METHODS:  # the weights of networks, too
+        own["method"] = method_question(contender.map)
     if contender.defaults:
         parameters = signature(plan).parameters.items()
         own["plan"] = {name: repr(parameter.default) for name, parameter in parameters}

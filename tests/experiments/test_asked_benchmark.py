@@ -44,6 +44,7 @@ from vprism_plan.simulation.scenes import Scene
 from vprism_plan.simulation.solids import Box
 
 HOW = Proposals()
+contending = importlib.import_module("experiments.planning_benchmark.contenders")
 running = importlib.import_module("experiments.planning_benchmark.run")
 
 
@@ -231,6 +232,17 @@ def test_a_network_adds_solids_to_the_seen_points(bench, key, monkeypatch):
     outside = points[:, 0] < 0.015
     np.testing.assert_array_equal(there[outside], seen[outside])
     assert not seen.all()
+
+
+def test_answers_depend_on_the_weights_and_on_what_the_planner_has_by_default(monkeypatch):
+    before = {key: contending.settings(CONTENDERS[key]) for key in ASKED}
+    monkeypatch.setattr(contending, "method_question", lambda key: {"weights": "others"})
+    after = {key: contending.settings(CONTENDERS[key]) for key in ASKED}
+    changed = {key for key in ASKED if after[key] != before[key]}
+    assert changed == {key for key in ASKED if CONTENDERS[key].map not in ("points", "truth")}
+    monkeypatch.setattr(contending, "plan", lambda checker, start, goal, *, margins=(0.01, 0.0): 0)
+    last = {key: contending.settings(CONTENDERS[key]) for key in ASKED}
+    assert [key for key in ASKED if last[key] != after[key]] == ["default"]
 
 
 # --- figures --------------------------------------------------------------------------
