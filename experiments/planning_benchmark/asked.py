@@ -215,8 +215,8 @@ def picture(figures: dict[str, Any], everyone: Sequence[Outcome]) -> "Figure":
     from experiments.planning_benchmark.pictures import style
     from vprism_plan.viz._figures import new_figure
 
-    figure = new_figure(13.0, 7.0)
-    left, right = figure.subplots(1, 2)
+    figure = new_figure(14.0, 7.5)
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     by_key, rows = {o.contender.key: o for o in everyone}, figures["contenders"]
     lines: dict[str, list[str]] = {}
     for c in (CONTENDERS[key] for key in rows):
@@ -229,9 +229,9 @@ def picture(figures: dict[str, Any], everyone: Sequence[Outcome]) -> "Figure":
             np.array([one["value"] if one[end] is None else one[end] for one in chosen])
             for end in ("value", "low", "high")
         )
-        x = np.arange(len(COSTS)) + 0.7 * ((number + 0.5) / len(lines) - 0.5)
-        left.errorbar(x, middle, np.abs([middle - low, high - middle]), color=color, marker=marker,
-                      linewidth=0.6, elinewidth=1.0, markersize=5.0, label=name)  # fmt: skip
+        x = np.arange(len(COSTS)) + 0.85 * ((number + 0.5) / len(lines) - 0.5)
+        left.errorbar(x, middle, np.abs([middle - low, high - middle]), fmt=marker, color=color,
+                      elinewidth=1.0, markersize=6.0, label=name)  # fmt: skip
         key = _suiting(keys, 9)
         curve = risk_curve(*risks(by_key[key].all))
         share = 100.0 * np.arange(1, len(curve) + 1) / rows[key]["asked"]
@@ -239,6 +239,8 @@ def picture(figures: dict[str, Any], everyone: Sequence[Outcome]) -> "Figure":
             share, 100.0 * curve, color=color, marker=marker, markevery=[-1] * len(curve[:1])
         )
     left.axhline(0.0, color="#000000", linewidth=0.8)
+    for number in range(len(COSTS) - 1):
+        left.axvline(number + 0.5, color="#cccccc")
     left.set_yscale("symlog", linthresh=1.0)
     ticks = (1, 0.5, 0, -0.5, -1, -3, -10, -30)
     left.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -250,9 +252,9 @@ def picture(figures: dict[str, Any], everyone: Sequence[Outcome]) -> "Figure":
     right.set_ylabel("answers that truly collide (%)")
     right.set_ylim(bottom=0.0)
     right.set_title("Does it know which answers to trust?", fontsize=10)
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3,
+    left.grid(axis="y", alpha=0.3)
+    right.grid(alpha=0.3)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4,
                   fontsize=8)  # fmt: skip
     return figure
 
@@ -310,18 +312,21 @@ def _points(figures: dict[str, Any]) -> list[str]:
         best = gain["best"]
         lines.append(
             f"- A collision as bad as {cost} reached goals are good: ours as it comes is worth "
-            f"{_figure(rows['default'][f'utility {cost}'])} per goal, the best without a posterior "
+            f"{_figure(rows['default'][f'utility {cost}'])} per goal, the best of the others "
             f"({full_label(CONTENDERS[best])}) {_figure(rows[best][f'utility {cost}'])}; "
             f"the difference is {_figure(gain)}."
         )
+    held: dict[str, list[str]] = {}
     for key, own in rows.items():
         bound = CheckerConfig().max_risk if key == "default" else CONTENDERS[key].bounds[-1][1]
         if bound is not None:
-            lines.append(
-                f"- {full_label(CONTENDERS[key])}: {own['collided']} of {own['answered']} answers "
-                f"collide, at most {100 * own['upper']:.1f} % (Clopper-Pearson, 95 %); the bound "
-                f"is {100 * bound:g} %."
+            name = full_label(CONTENDERS[key]) if key == "default" else CONTENDERS[key].line
+            held.setdefault(name, []).append(
+                f"at {100 * bound:g} % {own['collided']} of {own['answered']} "
+                f"(at most {100 * own['upper']:.1f} %)"
             )
+    for name, said in held.items():
+        lines.append(f"- Answers that collide by bound, {name}: {', '.join(said)}.")
     for name, words in (("unbound", "paths planned without a bound"), ("everything", "all paths")):
         own = figures["calibration"][name]
         if own is not None:
@@ -360,7 +365,7 @@ def _explanation(about: dict[str, Any]) -> list[str]:
         "collision, or else the clearance. The mean share of collisions over all ranks; less is "
         "better. **first 20 %**: that share when the best ranked answer 20 % of the goals.",
         "- **Stated probability**: of the whole path. With a bound, by worlds that the search has "
-        "not seen.",
+        "not seen. **At most**: upper end of Clopper and Pearson's 95 % interval.",
         "- **ours as it comes**: `World(map)`, `CheckerConfig()` and `plan()` with their defaults. "
         "**PointSDF**, **shape network alone**: their solids and the seen points. The others are "
         "those of the vetted benchmark.",

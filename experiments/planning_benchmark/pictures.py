@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _COLORS = ("#1b6ca8", "#2a9d5c", "#7b4ea3", "#c27c0e", "#0f8b8d", "#5b6b2f", "#8c564b", "#e377c2")
 _OTHERS = {
     "fcl": ("#b3261e", "s"), "fcl-fine": ("#e5736b", "s"), "points": ("#6b4c3b", "v"),
-    "octomap-free": ("#d9822b", "^"), "fcl-m10": ("#e5736b", "s"), "default": ("#000000", "p"),
+    "octomap-free": ("#d9822b", "^"), "fcl-m10": ("#e5736b", "s"), "default": ("#3d00b8", "p"),
     "pointsdf": ("#e8a33d", "X"), "network": ("#9aa5b1", "d"),
     "octomap-occupied": ("#444444", "P"), "sgd": ("#c2185b", "D"), "truth": ("#000000", "*"),
 }  # fmt: skip

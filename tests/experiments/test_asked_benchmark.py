@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.small_scenes import at, small_config, small_scene
+from scipy.stats import beta
 
 from experiments.planning_benchmark import (
     Answer,
@@ -391,7 +392,9 @@ def test_the_page_says_what_the_figures_say(tmp_path):
     assert len({line.count("|") for line in table}) == 1
     assert len(table) == 2 + len(made)
     row = figures["contenders"]["ours-r10"]
-    assert f"{row['collided']} of {row['answered']} answers collide" in text
+    assert f"at 10 % {row['collided']} of {row['answered']} (at most" in text
+    n, k = row["answered"], row["collided"]
+    assert row["upper"] == pytest.approx(beta.ppf(0.975, k + 1, n - k))
     for gain in figures["against"].values():
         worth = [figures["contenders"][k]["utility 3"]["value"] for k in ("points", "fcl-m10")]
         assert gain["best"] in ("points", "fcl-m10")
