@@ -3,8 +3,9 @@
 import numpy as np
 
 
-def draw_logits(map_, points, n_worlds, seed):
-    """Logits (n, S, K) of each draw at points (n, 3), straight from the definition."""
+def draw_logits(map_, points, n_worlds, seed, thresholds=True):
+    """Logits (n, S, K) of each draw at points (n, 3), straight from the definition; without
+    thresholds, those of the drawn weights."""
     weights = map_.sample_weights(n_worlds, seed)
     hinges = np.asarray(map_.space.hinges)
     away = ((points[:, None] - hinges) ** 2).sum(axis=2)
@@ -14,6 +15,14 @@ def draw_logits(map_, points, n_worlds, seed):
     logits = np.tensordot(features, weights, axes=(1, 1))
     if map_.prior is not None:
         logits += map_.prior.at(points)[:, None]
+    if not thresholds:
+        return logits
+    known = np.asarray(map_.informed(points))
+    # Of S draws one per object and part of [0, 1]: u < sigmoid(z) occupies.
+    rng = np.random.default_rng([seed, 0x10617])
+    for k in range(1, logits.shape[2]):
+        u = np.clip((rng.permutation(n_worlds) + 0.5) / n_worlds, 1 / 128, 1 - 1 / 128)
+        logits[known, :, k] += np.log(u) - np.log(1.0 - u)
     return logits
 
 

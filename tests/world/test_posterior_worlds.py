@@ -145,7 +145,7 @@ def test_draws_agree_with_predictions(demo_map):
     index = random_voxels(demo_map, rng, 900)
     predicted = demo_map.occupancy(H * index)
     n = 512
-    z = draw_logits(demo_map, H * index, n, 2)
+    z = draw_logits(demo_map, H * index, n, 2, thresholds=False)
     e = np.exp(z - z.max(axis=2, keepdims=True))
     # The draws' mean of the softmax is the prediction, up to the map's closed form for it.
     mean = 1.0 - (e[:, :, 0] / e.sum(axis=2)).mean(axis=1)
@@ -156,6 +156,9 @@ def test_draws_agree_with_predictions(demo_map):
     moments = demo_map.logit_moments(H * index)
     m, v = (a[:, None] for a in moments)
     fresh = m + np.sqrt(v) * rng.standard_normal((len(index), n, demo_map.n_classes))
+    informed = demo_map.informed(H * index)
+    assert 0.2 < informed.mean() < 0.98
+    fresh[informed, :, 1:] += rng.logistic(size=(informed.sum(), n, demo_map.n_classes - 1))
     share, expected = (
         np.mean(o > 0, axis=1)
         for o in (PosteriorWorlds(demo_map, n, seed=2).owners(index), owners_of(fresh))
@@ -163,6 +166,9 @@ def test_draws_agree_with_predictions(demo_map):
     p = 0.5 * (share + expected)
     spread = np.sqrt(2.0 * p * (1.0 - p) / n + 1.0 / n**2)
     assert np.abs((share - expected) / spread).max() < 5.0
+    # Where a prior has looked, that is the probability itself: a draw's own threshold decides.
+    assert np.abs(share - predicted)[informed].max() < 0.12
+    assert np.abs(share - predicted)[informed & (predicted > 0.1) & (predicted < 0.9)].mean() < 0.03
     assert np.mean(((share - expected) / spread)[(p > 0.05) & (p < 0.95)] ** 2) < 2.0
     # The most frequent owner is the class that the map finds likeliest.
     sure = predicted > 0.8

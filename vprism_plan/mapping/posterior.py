@@ -181,7 +181,15 @@ class VPrismMap:
         looked: around every object.
         """
         known = np.asarray(self.support(points)) >= min_support
-        return known if self.prior is None else known | self.prior.covers(np.asarray(points))
+        # A hypothesis of the user's own says nothing of what else hides around an object.
+        own = self.prior is not None and self.prior.own
+        return known if own else known | self.informed(points)
+
+    def informed(self, points: Any) -> Bool[np.ndarray, " n"]:
+        """Return where P(occupied) of points (N, 3) m says what is there, and not what a flat prior
+        says of everything: where a prior has looked, (N,)."""
+        points = np.asarray(points)
+        return np.zeros(len(points), bool) if self.prior is None else self.prior.covers(points)
 
     def logit_moments(
         self, points: Any

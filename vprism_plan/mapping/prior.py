@@ -243,13 +243,9 @@ class PriorField:
         return torch.stack(columns, dim=1)
 
     def covers(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-        """Return which points (m) lie in the grid of an object, where it alone counts.
-
-        None do with a prior of the user's own: a hypothesis of an object says nothing of what else
-        hides there.
-        """
+        """Return which points (m) lie in the grid of an object, where it alone counts."""
         last, inside = self.log_odds.shape[1] - 1, np.zeros(len(points), dtype=bool)
-        for pose in () if self.own else self.T_voxel_world:
+        for pose in self.T_voxel_world:
             at = points @ pose[:, :3].T + pose[:, 3]
             inside |= (np.minimum(at, last - at) >= FADE).all(axis=1)
         return inside

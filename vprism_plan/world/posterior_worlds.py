@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int, Int8, Int32, UInt8
 from scipy import ndimage
-from scipy.special import logsumexp, ndtr
+from scipy.special import logit, logsumexp, ndtr
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._kernels import risk as kernels
@@ -21,9 +21,11 @@ from vprism_plan.world.distance import checked_points
 from vprism_plan.world.grid import Chosen, Index, Points, Shape3, Slices, Values, window
 from vprism_plan.world.unseen_objects import UnseenObjects
 
-_MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
+MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
 _FINEST = 16.0  # stored steps per voxel, at most
 _MAX_VOXELS = 40_000_000
+_LEAST = 1.0 / 128.0  # P(occupied) below which no threshold makes a draw occupy a place
+_STREAM = 0x10617  # other random numbers than the weights'
 _GEMM_ROWS = 1024  # points per matrix product: their logits stay in the cache
 
 
@@ -39,9 +41,12 @@ class Tables:
 class PosteriorWorlds:
     """S joint draws of a map's weights: S worlds that the camera's view does not tell apart.
 
-    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1/2 at its centre x, the level
-    of the mesh, and belongs to the object of the largest logit. The same draw holds everywhere, so
-    what hides in one place is correlated with what hides next to it.
+    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s + t_s)_0 > 1/2 at its centre x, the
+    level of the mesh, and belongs to the object of the largest logit. The thresholds t_s, one per
+    object, are logistic: a map that says P(occupied) = 0.2, and is sure of that, is occupied in a
+    fifth of the draws. Where no prior has looked (`VPrismMap.informed`), and the map only says that
+    nobody knows, they are 0. The same draw holds everywhere, so what hides in one place is
+    correlated with what hides next to it.
 
     The surface of a draw lies between voxels, where its log-odds, linear between centres, are 0.
     An occupied voxel stands for the ball around its centre that reaches to the surface (at most a
@@ -91,10 +96,10 @@ class PosteriorWorlds:
         if whole("n_worlds", n_worlds, 64, error=WorldError) % 64:
             raise WorldError(f"n_worlds is {n_worlds}; it must be a multiple of 64")
         number("resolution", resolution, 0.0, unit="metres", above=True, error=WorldError)
-        if not 2.0 <= reach / resolution <= _MAX_REACH:
+        if not 2.0 <= reach / resolution <= MAX_REACH:
             raise WorldError(
                 f"reach is {reach} m, {reach / resolution:.1f} voxels of {resolution} m; it must "
-                f"be 2 to {_MAX_REACH} voxels: use a coarser resolution for larger balls"
+                f"be 2 to {MAX_REACH} voxels: use a coarser resolution for larger balls"
             )
         number("tolerance", tolerance, 0.0, 0.1, error=WorldError)
         self.map = map
@@ -383,12 +388,12 @@ def _left_to(unseen: UnseenObjects, found: Verdicts, n_objects: int) -> Verdicts
 def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
     """Find the voxels whose draws are certain, so that nobody has to draw them.
 
-    With Gaussian logits z of mean m and variance v, and C objects, a draw occupies a voxel only if
-    some z_k - z_0 > -ln C: by the union bound its probability is at most sum_k Phi(-(m_0 - m_k - ln
-    C) / sqrt(v_0 + v_k)). It does not give the voxel to class k only if z_k < z_0 or z_k < z_j for
-    another object j: a sum of the same form. The voxels with the smallest bounds are skipped, as
-    many as sum up to half the tolerance each way: that bounds the error of the probability of any
-    event, a path's collision included.
+    With Gaussian logits z of mean m and variance v, C objects, and thresholds within +-t, a draw
+    occupies a voxel only if some z_k - z_0 > -t - ln C: by the union bound its probability is at
+    most sum_k Phi(-(m_0 - m_k - t - ln C) / sqrt(v_0 + v_k)). It does not give the voxel to class k
+    only if z_k - z_0 < t or z_k - z_j < 2 t for another object j: a sum of the same form. The
+    voxels with the smallest bounds are skipped, as many as sum up to half the tolerance each way:
+    that bounds the error of the probability of any event, a path's collision included.
     """
     lower, upper = (np.asarray(corner) for corner in map_.support_bounds())
     n_objects = len(map_.object_ids)
@@ -433,14 +438,16 @@ def _tails(
         piece, rows = slice(start * slab, stop * slab), np.arange(len(points))
         gap = mean[:, 1:] - mean[:, :1]
         spread = np.sqrt(variance[:, 1:] + variance[:, :1])
-        occupied[piece] = ndtr((gap + np.log(n_objects)) / spread).sum(axis=1)
+        most = np.where(map_.informed(points), -logit(_LEAST), 0.0) + np.log(n_objects)
+        occupied[piece] = ndtr((gap + most[:, None]) / spread).sum(axis=1)
         best = gap.argmax(axis=1)
         apart = np.sqrt(variance[rows, 1 + best, None] + variance[:, 1:])
-        others = ndtr((gap - gap[rows, best, None]) / apart)
+        others = ndtr((gap - gap[rows, best, None] + 2.0 * most[:, None]) / apart)
         others[rows, best] = 0.0
-        lost[piece] = ndtr(-gap[rows, best] / spread[rows, best]) + others.sum(axis=1)
+        lost[piece] = ndtr((most - gap[rows, best]) / spread[rows, best]) + others.sum(axis=1)
         owner[piece] = best + 1
-        steps = np.floor(-kernels.ODDS * (logsumexp(gap, axis=1) + 2.0 * spread[rows, best]))
+        surely = most - np.log(n_objects) + logsumexp(gap, axis=1) + 2.0 * spread[rows, best]
+        steps = np.floor(-kernels.ODDS * surely)
         odds[piece] = steps.clip(1, kernels.MOST_ODDS)
     return occupied, lost, owner, odds
 
@@ -452,6 +459,15 @@ def _skippable(bound: Values, budget: float) -> Chosen:
     skip = np.zeros(len(bound), np.bool_)
     skip[order[:count]] = True
     return skip
+
+
+def thresholds(n_worlds: int, n_objects: int, seed: int) -> Values:
+    """Log-odds (S, C) that each draw adds to each object's: logistic, so that the share of draws
+    above 0 is the probability; one from each of S equally probable parts, in an order of its own
+    per object, and none beyond `_LEAST` on either side."""
+    rng = np.random.default_rng([seed, _STREAM])
+    at = np.stack([rng.permutation(n_worlds) for _ in range(n_objects)], axis=1)
+    return np.asarray(logit(((at + 0.5) / n_worlds).clip(_LEAST, 1.0 - _LEAST)))
 
 
 class Owners:
@@ -546,6 +562,8 @@ class Owners:
         rows."""
         if self._weights is None:
             weights = self._map.sample_weights(self._n_worlds, self._seed)
+            own = thresholds(weights.shape[0], weights.shape[2] - 1, self._seed)
+            self._thresholds = np.pad(own, ((0, 0), (1, 0))).ravel()
             self._weights = np.moveaxis(weights, 0, 1).reshape(weights.shape[1], -1)
         return self._weights
 
@@ -583,4 +601,5 @@ class Owners:
         logits = phi @ weights[near] + weights[-1]
         if self._map.prior is not None:
             logits += np.tile(self._map.prior.at(points), self._n_worlds)
+        logits[self._map.informed(points)] += self._thresholds
         kernels.classify(logits, self._n_worlds, weights.shape[1] // self._n_worlds, out, odds)
