@@ -87,7 +87,7 @@ def make_checker(n_balls: int, config: vp.MapConfig, n_worlds: int) -> Collision
     map_ = vp.fit_map(scene(n_balls).observation, config, seed=0)
     # Only draws are obstacles, and the table: no shadow that is one by policy.
     world = vp.World(map_, vp.WorldConfig(occluded="free"))
-    return CollisionChecker(world, free_ball(), CheckerConfig(n_worlds=n_worlds))
+    return CollisionChecker(world, free_ball(), CheckerConfig(n_worlds=n_worlds, max_risk=None))
 
 
 def half_width(n_balls: int) -> float:

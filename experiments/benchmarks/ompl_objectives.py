@@ -78,8 +78,9 @@ class Bench:
         # What the objectives are told apart by are the objects of the map.
         config = vp.WorldConfig(occluded="posterior", hidden_objects=math.inf)
         self.world = vp.World(load_map(file), config)
-        self.checker = CollisionChecker(self.world, self.robot)
-        self.wary = CollisionChecker(self.world, self.robot, CheckerConfig(margin=0.02))
+        self.checker = CollisionChecker(self.world, self.robot, CheckerConfig(max_risk=None))
+        wary = CheckerConfig(margin=0.02, max_risk=None)
+        self.wary = CollisionChecker(self.world, self.robot, wary)
         self.judge = CollisionChecker(self.world, self.robot, CheckerConfig(**JUDGES))
 
     def risk(self, path: np.ndarray) -> float:

@@ -108,7 +108,8 @@ def main() -> None:
     base = np.eye(4)
     base[0, 3] = -0.5
     robot = vp.Robot.from_urdf(ROOT / "urdf" / "panda.urdf", base_pose=base)
-    paths = batch(vp.CollisionChecker(world, robot), args.trajectories, args.waypoints, seed=0)
+    checker = vp.CollisionChecker(world, robot, vp.CheckerConfig(max_risk=None))
+    paths = batch(checker, args.trajectories, args.waypoints, seed=0)
     q = torch.from_numpy(paths).float().requires_grad_()
     print(f"{robot.name}: {len(robot.sphere_radii)} spheres, batch {tuple(q.shape)}, float32")
     for subsamples in (1, None):

@@ -132,7 +132,8 @@ def scene_checker(kind: str, seed: int, cache: Path) -> vp.CollisionChecker:
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         vp.fit_map(generate(kind, seed).observation, vp.MapConfig(), seed=0).save(file)
-    return vp.CollisionChecker(vp.World(vp.load_map(file)), benchmark_robot())
+    world = vp.World(vp.load_map(file), vp.WorldConfig(occluded="occupied"))
+    return vp.CollisionChecker(world, benchmark_robot(), vp.CheckerConfig(max_risk=None))
 
 
 def low_ends(checker: vp.CollisionChecker, rng: np.random.Generator) -> np.ndarray:

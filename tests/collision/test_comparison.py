@@ -156,7 +156,8 @@ def test_voxel_inflation(blob, ball_robot, edge_of_blob):
 
 def test_occluded(seen, ball_robot):
     _, map_ = seen
-    world, robot = vp.World(map_), ball_robot(0.01)
+    config = vp.WorldConfig(occluded="occupied")
+    world, robot = vp.World(map_, config), ball_robot(0.01)
     behind = np.array([0.1, 0.0, 0.06])
     assert world.status(behind[None])[0] == 1
     checker = vp.CollisionChecker(world, robot)
@@ -170,7 +171,8 @@ def test_occluded(seen, ball_robot):
 def test_background_and_thin_parts(seen, ball_robot):
     scene, map_ = seen
     world, robot = vp.World(map_, vp.WorldConfig(occluded="free")), ball_robot(0.004)
-    checker, meshes = vp.CollisionChecker(world, robot), vp.MeshChecker(world, robot, seen=False)
+    checker = vp.CollisionChecker(world, robot, vp.CheckerConfig(max_risk=None))
+    meshes = vp.MeshChecker(world, robot, seen=False)
     points, _ = scene.observation.points()
     _, bar, clutter = scene.solids
     on_clutter = points[(np.abs(clutter.signed_distance(points)) < 1e-3) & (points[:, 2] > 0.04)]
@@ -192,7 +194,7 @@ def test_background_and_thin_parts(seen, ball_robot):
 def test_what_a_camera_saw_is_held_against_any_map(seen, ball_robot):
     """The images have a say of their own: a field that lost a thing is told so."""
     scene, map_ = seen
-    world, robot = vp.World(map_), ball_robot(0.004)
+    world, robot = vp.World(map_, vp.WorldConfig(occluded="occupied")), ball_robot(0.004)
     meshes, lost = vp.MeshChecker(world, robot), Free(world, robot)
     points, _ = scene.observation.points()
     _, bar, clutter = scene.solids

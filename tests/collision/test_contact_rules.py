@@ -53,7 +53,9 @@ def world():
 def make(world, hand):
     def checker(allowed=None, **changes):
         return CollisionChecker(
-            world, hand, CheckerConfig(allowed_contacts=allowed or {}, **changes)
+            world,
+            hand,
+            CheckerConfig(**{"allowed_contacts": allowed or {}, "max_risk": None, **changes}),
         )
 
     return checker

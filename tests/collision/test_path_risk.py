@@ -57,7 +57,7 @@ def strict_world(small):
 def all_drawn(world, n_worlds):
     """The world, no voxel of whose draws is taken for certain: then they are the oracle's."""
     drawn = vp.PosteriorWorlds(world.map, n_worlds, 7, H, reach=0.25, tolerance=0.0)
-    world._draws[n_worlds, 7] = drawn
+    world._draws[n_worlds, 7, H] = drawn
     return world
 
 
@@ -649,7 +649,8 @@ def on_level_set(checker, places, room=0.0):
     """Where a ball touches what verdicts go by beside the draws: the level set, or, if the bound
     is above the level, what was seen."""
     below = checker.config.max_risk < checker.world.config.level
-    field = checker.world.certain_field(level_set=below, seen=not below)
+    world = checker.world
+    field = world.field if below else world.certain_field(seen=True)
     return field.lower_bound(np.ascontiguousarray(places)) <= RADIUS + room
 
 
@@ -703,7 +704,7 @@ def test_edges_are_free_if_their_joint_risk_is_within_the_bound(bounded, doubtfu
             assert report.risk.upper > bound
             assert 0.0 <= report.collision_fraction <= 1.0
             assert "too risky" in report.text()
-            assert report.risk.first_contact[0].body in report.text()
+            assert all(cause.body in report.text() for cause in report.risk.first_contact[:1])
             # At the stated fraction more worlds have collided than may.
             there = qa + report.collision_fraction * (qb - qa)
             part = checker.collision_probability([qa, there + 1e-9 * (qb - qa)])
@@ -792,14 +793,18 @@ def test_worlds_without_a_posterior_are_refused():
     checker = CollisionChecker(world, as_robot(arrays))
     with pytest.raises(ConfigError, match="posterior"):
         checker.collision_probability(np.zeros(2))
-    with pytest.raises(ConfigError, match="posterior"):
-        CollisionChecker(world, as_robot(arrays), CheckerConfig(max_risk=0.1))
+    # Where nothing is uncertain, a bound on risk asks for no more than the surfaces.
+    assert checker.config.max_risk == 0.1
+    assert checker.max_risk is None
+    Q = np.random.default_rng(1).uniform(-3.0, 3.0, (300, 2))
+    plain = CollisionChecker(world, as_robot(arrays), CheckerConfig(max_risk=None))
+    np.testing.assert_array_equal(checker.is_valid_batch(Q), plain.is_valid_batch(Q))
 
 
 def test_a_bound_on_risk_does_not_let_a_ball_shave_the_level_set(free_world, ball_robot, doubtful):
     """Voxels count as inscribed balls: the draws alone passed paths 2 mm inside seen surfaces."""
     robot = ball_robot(RADIUS)
-    plain = CollisionChecker(free_world, robot, config())
+    plain = CollisionChecker(free_world, robot, config(max_risk=None))
     bounded = CollisionChecker(free_world, robot, config(max_risk=0.3))
     loose = CollisionChecker(free_world, robot, config(max_risk=0.6))
     rng = np.random.default_rng(5)
@@ -827,3 +832,20 @@ def test_a_wider_margin_keeps_a_tightened_bound(bounded, doubtful):
     assert not (wider.is_valid_batch(Q) & ~plain.is_valid_batch(Q)).any()
     # Above the level what was seen refuses most of what a tighter bound would.
     assert wider._bounded.allowed == tight._bounded.allowed < plain._bounded.allowed
+
+
+def test_balls_too_large_for_fine_voxels_are_asked_about_in_coarser_ones(small, ball_robot):
+    """The default bound on risk made every robot with a sphere of 28 cm an error."""
+    radius = 0.3
+    world = vp.World(small, vp.WorldConfig(occluded="free"))
+    world._draws[S, 7, 2 * H] = vp.PosteriorWorlds(small, S, 7, 2 * H, reach=0.5, tolerance=0.0)
+    checker = CollisionChecker(world, ball_robot(radius), config())
+    assert setting(checker).worlds.resolution == 2 * H
+    drawn = DrawnVoxels(small, S, 7, 2 * H)
+    some, rng = 0, np.random.default_rng(8)
+    for way in rng.normal(size=(60, 3)):
+        q = [0.05, 0.0, 0.05] + way / np.linalg.norm(way) * rng.uniform(0.3, 0.42)
+        touched = swept(checker, q[None]).touched.astype(bool)
+        np.testing.assert_array_equal(touched, ball_touches(drawn, q, radius, 2 * H))
+        some += 0 < touched.sum() < S
+    assert some > 0

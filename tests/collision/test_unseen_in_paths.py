@@ -61,7 +61,8 @@ def test_a_path_meets_them_as_often_as_the_model_says(worlds, ball_robot):
 
 def test_verdicts_and_their_reasons(worlds, crowded, ball_robot):
     q = WAY[0]
-    plain = {d: CollisionChecker(w, ball_robot(0.03)) for d, w in worlds.items()}
+    config = CheckerConfig(max_risk=None)
+    plain = {d: CollisionChecker(w, ball_robot(0.03), config) for d, w in worlds.items()}
     assert [plain[d].is_valid(q) for d in (0.0, 2.0, 60.0, math.inf)] == [True, True, True, False]
     assert [contact.kind for contact in plain[math.inf].explain(q).contacts] == ["occluded"]
     bounded = {

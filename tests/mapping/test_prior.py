@@ -267,7 +267,7 @@ def test_no_speck_of_a_guess_is_outside_the_level_set(scene, adversary):
     rng = np.random.default_rng(1)
     fitted = fit_map(scene.observation, prior=lambda _, ids, plane: adversary(rng, len(ids)))
     world = World(fitted, WorldConfig(occluded="free"))
-    field = world.certain_field(level_set=True, seen=False)
+    field = world.field
     lower, upper = fitted.support_bounds()
     lower[2] = 0.002
     points = rng.uniform(lower, upper, (1_500_000, 3))
@@ -350,7 +350,7 @@ def test_a_hypothesis_beyond_the_kernels_is_in_the_level_set_and_in_the_draws():
     hidden = inside[((inside < lower) | (inside > upper)).any(axis=1)]
     hidden = hidden[fitted.occupancy(hidden) > 0.9]
     assert len(hidden) > 5
-    field = World(fitted, WorldConfig(occluded="free")).certain_field(level_set=True, seen=False)
+    field = World(fitted, WorldConfig(occluded="free")).field
     assert (field.lower_bound(hidden) <= 0.0).all()
     draws = PosteriorWorlds(fitted, n_worlds=64, seed=0)
     assert draws.touched(hidden, 0.005).mean() > 0.9

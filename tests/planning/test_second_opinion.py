@@ -108,7 +108,8 @@ def around_a_blob(tmp_path_factory):
 
     def make(radius):
         spheres = {"cube": [{"center": [0.0, 0.0, 0.0], "radius": radius}]}
-        return CollisionChecker(world, Robot.from_urdf(path, spheres=spheres))
+        robot = Robot.from_urdf(path, spheres=spheres)
+        return CollisionChecker(world, robot, CheckerConfig(max_risk=None))
 
     return make
 
@@ -129,7 +130,7 @@ def test_meshes_name_the_link_that_sticks_out_of_its_spheres(around_a_blob):
     """The checker only knows a small ball; its cube scrapes the object on the way."""
     checker = around_a_blob(0.01)
     start, goal = [-0.2, 0.05], [0.2, 0.05]
-    result = plan(checker, start, goal, second_opinion=MeshChecker.like(checker))
+    result = plan(checker, start, goal, second_opinion=MeshChecker.like(checker), margins=None)
     assert result.solved
     assert result.path is not None
     (found,) = result.report.second_opinion.findings

@@ -20,7 +20,8 @@ def test_no_accepted_configuration_touches_a_wholly_hidden_object(seed, ball_rob
     scene = hidden_object_scene(seed)
     assert 2 not in scene.observation.object_ids
     hidden = scene.solids[scene.labels.index(2)]
-    world = vp.World(vp.fit_map(scene.observation, seed=seed))
+    fitted = vp.fit_map(scene.observation, seed=seed)
+    world = vp.World(fitted, vp.WorldConfig(occluded="occupied"))
     checker = vp.CollisionChecker(world, ball_robot(RADIUS))
     rng = np.random.default_rng(seed)
     Q = points_near(hidden, rng, 4000, 0.05)

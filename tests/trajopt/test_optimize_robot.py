@@ -54,7 +54,7 @@ def test_from_nothing_with_the_default_cost(checker):
     shortened = vp.plan(checker, START, GOAL)
     assert length(result.path) < 1.02 * shortened.report.path_length
     assert result.report.min_clearance > shortened.report.min_clearance
-    names = {"smoothness", "clearance", "self-collision", "joint limits"}
+    names = {"smoothness", "clearance", "risk", "self-collision", "joint limits"}
     assert set(result.history.terms) == names
 
 
@@ -80,9 +80,9 @@ def test_a_bound_on_risk_holds_for_the_whole_path(demo_world, panda):
 
 
 def test_a_goal_that_touches_what_it_may(demo_world, panda):
-    plain = vp.CollisionChecker(demo_world, panda)
+    plain = vp.CollisionChecker(demo_world, panda, vp.CheckerConfig(max_risk=None))
     assert optimize(plain, GOAL, TOUCHING).status == "invalid_goal"
-    rules = vp.CheckerConfig(allowed_contacts={"hand": {1}})
+    rules = vp.CheckerConfig(allowed_contacts={"hand": {1}}, max_risk=None)
     ruled = vp.CollisionChecker(demo_world, panda, rules)
     result = optimize(ruled, GOAL, TOUCHING, seeds=3)
     assert result.solved

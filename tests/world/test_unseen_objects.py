@@ -376,3 +376,22 @@ def test_nearest_grids_are_nearest(wall_map):
         found = np.linalg.solve(pose[:, :3], here - pose[:, 3])
         assert np.linalg.norm(found - point) <= away[k] + 1e-9
         assert ((here >= 2.0) & (here <= SIDE - 3.0)).all()
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_coarser_voxels_hold_all_that_the_finer_ones_held(factor):
+    rng = np.random.default_rng(6)
+    fine = everywhere(30.0, lower=(-0.31, -0.12, -0.03), upper=(0.2, 0.35, 0.2))
+    fine = dataclasses.replace(fine, mask=fine.mask & (rng.random(fine.mask.shape) < 0.1))
+    coarse = fine.coarser(factor)
+    assert coarse.resolution == pytest.approx(factor * H)
+    corners = np.stack(np.meshgrid(*[(-0.499, 0.499)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points = (np.argwhere(fine.mask) + fine.first)[:, None] + corners
+    voxel = np.floor(points.reshape(-1, 3) / factor + 0.5).astype(int) - coarse.first
+    middle = np.floor((np.argwhere(fine.mask) + fine.first) / factor + 0.5).astype(int)
+    assert coarse.mask[tuple((middle - coarse.first).T)].all()
+    inside = ((voxel >= 0) & (voxel < coarse.mask.shape)).all(axis=1)
+    assert inside.mean() > 0.9
+    # As many of them stand there, on the same floor.
+    counts = [len(unseen.draw(4096, 3)) for unseen in (fine, coarse)]
+    assert counts[0] == pytest.approx(counts[1], rel=0.05)

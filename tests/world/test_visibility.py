@@ -160,7 +160,7 @@ def test_posterior_policy_trusts_the_map_only_where_it_has_support(hidden_scene)
     )
     bounds = ((-0.5, -0.5, 0.0), (0.5, 0.5, 0.4))
     believing = World(map_, WorldConfig(occluded="posterior", bounds=bounds))
-    wary = World(map_, WorldConfig(bounds=bounds))
+    wary = World(map_, WorldConfig(occluded="occupied", bounds=bounds))
     assert believing.field.lower_bound(hinge[None])[0] > 0.01
     assert wary.field.lower_bound(hinge[None])[0] <= 0.0
     points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (20000, 3))
@@ -173,8 +173,9 @@ def test_second_view_clears_what_it_sees(hidden_scene):
     behind = Camera.look_at(first.center * (-1, -1, 1), np.array([0.0, 0.0, 0.05]))
     second = render(hidden_scene, behind)
     bounds = ((-0.4, -0.4, 0.0), (0.4, 0.4, 0.4))
-    one = World(_empty_map(hidden_scene.observation), WorldConfig(bounds=bounds))
-    two = World(_empty_map(hidden_scene.observation, second), WorldConfig(bounds=bounds))
+    config = WorldConfig(occluded="occupied", bounds=bounds)
+    one = World(_empty_map(hidden_scene.observation), config)
+    two = World(_empty_map(hidden_scene.observation, second), config)
     points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (20000, 3))
     points = points[points[:, 2] > 0.01]
     before, after = one.status(points), two.status(points)

@@ -125,8 +125,8 @@ def _plan(command: _Parser) -> None:
     take("--goal-pose X Y Z QW QX QY QZ", float, text)
     take("--planner NAME", str, "OMPL planner; a name that is none lists them", "RRTConnect")
     take("--time-limit S", float, "wall time for the search, s", 5.0)
-    text = "clearance to keep, m; the true surface can lie a few millimetres outside the map's"
-    take("--margin M", float, text, 0.005)
+    text = "clearance to keep, m; where there is room, the path keeps 5 to 20 mm more"
+    take("--margin M", float, text, 0.0)
     _rules(command)
     take("--frame N", int, "image of a BOP scene; default the first")
     take("--seed N", int, "of the fit, of what is chosen, and of the planner", 0)
@@ -236,13 +236,13 @@ def _base(command: _Parser, default: str) -> None:
 
 def _rules(command: _Parser) -> None:
     text = (
-        "bound on the probability of touching anything (0 to 1): objects are then judged by "
-        "draws from the map's posterior, not by its level set"
+        "bound on the probability of touching anything, by draws from the map's posterior; 1 for "
+        "none: then the level set alone decides"
     )
-    command.take("--max-risk P", float, text)
+    command.take("--max-risk P", float, text, 0.1)
     text = "contacts to allow: a link or group of the robot and an object's id, as hand:3"
     command.take("--allow LINK:ID ...", str, text, ())
     text = "what space behind visible surfaces counts as"
-    command.take("--occluded POLICY", ("occupied", "posterior", "free"), text, "occupied")
+    command.take("--occluded POLICY", ("occupied", "posterior", "free"), text, "posterior")
     text = "what space outside the image counts as"
     command.take("--unobserved POLICY", ("free", "occupied"), text, "free")

@@ -29,6 +29,12 @@ PLAN_FILES = (*_PICTURES, *_DATA)
 _POLICIES = ("occluded", "unobserved", "level", "resolution")  # of a world, in the report
 _PROFILE = 64  # clearances along the path in the report
 
+_HIDDEN = {
+    "posterior": "judged by its probability where the map can, else an obstacle",
+    "occupied": "an obstacle",
+    "free": "judged by its probability",
+}
+
 Distance = Callable[[np.ndarray], np.ndarray]
 
 
@@ -39,7 +45,7 @@ def run_demo(command: Command, console: Console) -> int:
     camera's side of the clutter to the far side, where short objects stand hidden behind
     tall ones. The truth about the scene enters only the report and the pictures.
     """
-    from vprism_plan.collision import CheckerConfig, CollisionChecker
+    from vprism_plan.collision import CollisionChecker
     from vprism_plan.robots import Robot
     from vprism_plan.simulation import load_ground_truth
     from vprism_plan.world import World
@@ -52,7 +58,7 @@ def run_demo(command: Command, console: Console) -> int:
     pose = around.base_pose([0.05, -0.6, 0.0], np.pi / 2)  # beside the clutter, facing it
     robot = Robot.from_urdf(urdf_path("panda"), base_pose=pose)
     with console.stage("check"):  # compiles on first use
-        checker = CollisionChecker(world, robot, CheckerConfig(margin=0.005))
+        checker = CollisionChecker(world, robot)
     with console.stage("place"):
         ends = choose_ends(checker, around, np.random.default_rng(seed))
     if ends is None:
@@ -136,7 +142,8 @@ def checks(command: Command, robot: "Robot") -> "CheckerConfig":
             )
         robot.links_of(name)
         allowed.setdefault(name, set()).add(int(number))
-    return CheckerConfig(margin=command.margin, max_risk=command.max_risk, allowed_contacts=allowed)
+    max_risk = None if command.max_risk == 1.0 else command.max_risk
+    return CheckerConfig(margin=command.margin, max_risk=max_risk, allowed_contacts=allowed)
 
 
 def pose_matrix(pose: tuple[float, ...]) -> np.ndarray:
@@ -324,6 +331,6 @@ def _lines(payload: dict[str, Any], result: "PlanResult") -> list[str]:
     return [
         *lines,
         f"unseen: up to {100 * share:.0f} % of the arm is where no camera looked, which counts "
-        f"as {world['unobserved']}; hidden space counts as {world['occluded']}",
+        f"as {world['unobserved']}; hidden space: {_HIDDEN[world['occluded']]}",
         f"trajectory: {payload['trajectory']['duration']:.1f} s",
     ]

@@ -4,6 +4,7 @@
 import copy
 import threading
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.collision import entropy, explain, margins, motion
 from vprism_plan.collision.config import CheckerConfig, contact_rules
 from vprism_plan.collision.packing import (
+    MARGIN,
     Configuration,
     Numbers,
     PackedWorld,
@@ -31,6 +33,13 @@ from vprism_plan.world.grid import Chosen, Values
 
 _BATCH_CHUNK = 512
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
+
+
+def _wider(world: PackedWorld, extra: float) -> PackedWorld:
+    distance, blocks, floats = world
+    floats = floats.copy()
+    floats[MARGIN] += extra
+    return distance, blocks, floats
 
 
 class CollisionChecker(explain.Checker):
@@ -51,7 +60,8 @@ class CollisionChecker(explain.Checker):
         world: a `vprism_plan.World`, or anything that has its `field` (origin, spacing, distance
             and source at nodes), `planes`, `plane_names`, `sources`, `config` (the policies
             `occluded` and `unobserved`), `map.occupancy(points)` and `status(points)`. Contact
-            rules and probabilities need a `World`.
+            rules and probabilities need a `World`; to any other a bound on risk means nothing more
+            than its surfaces.
         robot: a `vprism_plan.Robot`.
         config: margins and tolerances.
     """
@@ -73,10 +83,12 @@ class CollisionChecker(explain.Checker):
         self._lock = threading.Lock()
         self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
-        self._levels: tuple[int, ...] = ()  # of `tightened`, in turn
-        if self.config.max_risk is not None:
+        if self.config.max_risk is not None and hasattr(
+            getattr(world, "map", None), "sample_weights"
+        ):
             self._bounded = self._risk()
-            self._fields, self._world = self._within_what_was_seen(self.config.max_risk)
+            if self.config.max_risk >= world.config.level:
+                self._fields, self._world = self._what_was_seen
         self._warm_up()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -87,20 +99,16 @@ class CollisionChecker(explain.Checker):
         self.__dict__.update(state)
         self._lock = threading.Lock()
 
-    def _within_what_was_seen(self, bound: float) -> tuple[list[Any], PackedWorld]:
-        """Return what verdicts under a bound on risk go by beside the draws.
+    @cached_property
+    def _what_was_seen(self) -> tuple[list[Any], PackedWorld]:
+        """What verdicts go by beside the draws where these judge the level set: what was seen.
 
         Touching a point that is occupied with at least the probability `level` breaks a bound below
         the level by itself; the draws, counted as the balls inside voxels, would alone let a
-        planner shave millimetres off a surface that everybody sees. Under a bound above the level
-        the seen surfaces alone are obstacles.
+        planner shave millimetres off a surface that everybody sees.
         """
-        world = self._ruled_world()
-        within = bound < world.config.level
-        fields = [
-            world.certain_field(ids, level_set=within, seen=not within) for ids in self._rules
-        ]
-        return fields, pack_world(world, fields, self.config.margin)
+        fields = [self.world.certain_field(ids, seen=True) for ids in self._rules]
+        return fields, pack_world(self.world, fields, self.config.margin)
 
     def _warm_up(self) -> None:
         """Ask every kernel once, so that none compiles inside a planner's time limit."""
@@ -195,23 +203,38 @@ class CollisionChecker(explain.Checker):
         if self._bounded is None:
             raise ConfigError("max_risk is None; only a bound on risk can be tightened")
         bounded = self._bounded.tightened(level)
-        if bounded is None:
-            return None
-        stricter = copy.copy(self)
-        stricter._bounded = bounded
-        stricter._levels = (*self._levels, level)
-        return stricter
+        return None if bounded is None else self._with(_bounded=bounded)
 
     def with_extra_margin(self, extra: float) -> "CollisionChecker":
-        """Return the same checker with `extra` metres more margin."""
+        """Return the same checker with `extra` metres more margin from surfaces.
+
+        The bound on risk stays what it is: that of coming within this checker's own margin.
+        Everything is shared.
+        """
         number("extra", extra, 0.0, unit="metres: a margin can only be widened")
-        config = replace(self.config, margin=self.config.margin + extra)
-        wider = CollisionChecker(self.world, self.robot, config)
-        for level in self._levels:
-            tightened = wider.tightened(level)
-            assert tightened is not None  # the same bound and the same draws as here
-            wider = tightened
-        return wider
+        other = self._with(
+            config=replace(self.config, margin=self.config.margin + extra),
+            _world=_wider(self._world, extra),
+            _surfaces=_wider(self._surfaces, extra),
+        )
+        vars(other).pop("_what_was_seen", None)  # packed with the margin
+        return other
+
+    def relaxed(self, max_risk: float) -> "CollisionChecker":
+        """Return the same checker with another bound on risk, and with the level set left to the
+        draws: what was seen, and what is certain, stays out of the question. ConfigError without
+        a `max_risk`."""
+        if self._bounded is None:
+            raise ConfigError("max_risk is None; only a bound on risk can be relaxed")
+        config = replace(self.config, max_risk=max_risk)
+        fields, world = self._what_was_seen
+        bounded = self._bounded.bounded_by(config)
+        return self._with(config=config, _bounded=bounded, _fields=fields, _world=world)
+
+    def _with(self, **changes: Any) -> "CollisionChecker":
+        other = copy.copy(self)
+        vars(other).update(changes)
+        return other
 
     def contacts(self, q: Numbers) -> tuple[Contact, ...]:
         """Return every reason to refuse q: the deepest contact of each link and body first,
@@ -282,7 +305,7 @@ class CollisionChecker(explain.Checker):
     @property
     def max_risk(self) -> float | None:
         """Bound on the probability of collision of what is valid, or None."""
-        return self.config.max_risk
+        return None if self._bounded is None else self._bounded.setting.config.max_risk
 
     def collision_probability(self, path: Numbers, held_out: bool = False) -> RiskEstimate:
         """Return the probability that a path (T, dof), or a configuration (dof,), touches anything.

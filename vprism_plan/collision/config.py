@@ -22,14 +22,16 @@ class CheckerConfig:
         min_motion: edges are certified continuously until no sphere can move more than this between
             two checked configurations. A point of such a gap is at most half of it away from a
             configuration known to be free: the tolerance of `check_motion`.
-        max_risk: bound on the probability of collision. With a bound, the objects of the map (and
-            occluded space where the map has support, or `WorldConfig.hidden_objects` judges it) are
-            judged by worlds drawn from its posterior, at P(occupied) = 1/2 of each draw whatever
-            `WorldConfig.level` is: a configuration or an edge is free if the upper confidence bound
-            of its probability of coming within `margin` is at most `max_risk`. Everything else is
-            refused as without a bound, and so is the level set if `max_risk` is below its level:
-            draws are counted by voxels, and alone would let a path shave a surface that was seen.
-            None: level set.
+        max_risk: bound on the probability of collision. A collision that is c times as bad as a
+            reached goal is good is worth risking up to 1 / (1 + c): 0.1 (default) is c = 9. With a
+            bound, the map's objects, what of hidden space is the map's to judge, and objects that
+            nobody saw (`WorldConfig.hidden_objects`) are judged by worlds drawn from the posterior
+            (`PosteriorWorlds`), whatever `WorldConfig.level` is: a configuration or an edge is free
+            if the upper confidence bound of its probability of coming within `margin` is at most
+            `max_risk`. Everything else is refused as without a bound, and so is the level set if
+            `max_risk` is below its level: draws are counted by voxels, and alone would let a path
+            shave a surface that was seen. None: the level set alone. A world without a posterior is
+            certain: its surfaces decide.
         allowed_contacts: link or SRDF group -> ids of the objects it may touch; for example
             {"hand": {3}}. What a link may touch, it may also pass through.
         n_worlds: worlds drawn for probabilities, a multiple of 64.
@@ -40,7 +42,7 @@ class CheckerConfig:
     margin: float = 0.0
     self_margin: float = 0.0
     min_motion: float = 0.002
-    max_risk: float | None = None
+    max_risk: float | None = 0.1
     allowed_contacts: Mapping[str, Any] = field(default_factory=dict, hash=False)
     n_worlds: int = 256
     risk_seed: int = 0

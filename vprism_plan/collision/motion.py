@@ -328,7 +328,7 @@ class _March:
 
     def _span(self, fraction: float) -> float:
         """Return how far the clearances at a fraction reach, a voxel in reserve."""
-        if self.checker.config.max_risk is not None:
+        if self.checker.max_risk is not None:
             return 0.0
         Q, config = self.at(fraction)[None], self.checker.config
         self.count += 1

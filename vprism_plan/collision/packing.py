@@ -27,6 +27,7 @@ Rows = Float[np.ndarray, "_ _"]
 Waypoints = Float[np.ndarray, "_ _"]
 
 _HEADER = 24
+MARGIN = 6  # where the floats of a packed world hold the clearance to keep
 AT_MOST = 200_000  # configurations that one query may ask about
 # An array, a tensor, a list or a tuple.
 Numbers = ArrayLike | Sequence[Any]

@@ -3,6 +3,7 @@
 the probability that it collides, and estimates of that."""
 
 import copy
+import math
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.explain import nearest_source
 from vprism_plan.collision.packing import (
     AT_MOST,
+    MARGIN,
     Configuration,
     Rows,
     Waypoints,
@@ -28,6 +30,7 @@ from vprism_plan.collision.reports import Contact, FirstContact, RiskEstimate, a
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.world import PosteriorWorlds
 from vprism_plan.world.grid import Chosen
+from vprism_plan.world.posterior_worlds import MAX_REACH
 from vprism_plan.world.visibility import OCCLUDED, OUTSIDE, SEEN, UNSEEN
 
 _HELD_OUT = 1_000_003  # added to the seed of the draws
@@ -90,7 +93,7 @@ class Setting:
         """The same for the kernels, with the margin: distances, block bounds, floats."""
         distance, blocks, floats = self.certain.packed
         floats = floats.copy()
-        floats[6] += self.margin
+        floats[MARGIN] += self.margin
         return distance, blocks, floats
 
 
@@ -112,8 +115,12 @@ def make_setting(
     radii = arrays.sphere_radius.copy()  # kernels get it
     resolution = float(world.field.spacing)
     room = _ROOM if config.max_risk is None else _ROOM + PADDINGS[-1]
-    reach = float(np.max(radii[moving], initial=0.0)) + config.margin + room * resolution
-    worlds = world.posterior_worlds(config.n_worlds, config.risk_seed, reach=reach)
+    largest = float(np.max(radii[moving], initial=0.0)) + config.margin
+    # Larger balls than the kernels' squares of distances can hold need coarser voxels.
+    resolution *= max(1, math.ceil(largest / ((MAX_REACH - room) * resolution)))
+    worlds = world.posterior_worlds(
+        config.n_worlds, config.risk_seed, largest + room * resolution, resolution
+    )
     tables = np.array([worlds.rule(ids) for ids in rules], dtype=np.int64)
     per_link = np.where(arrays.link_fixed, -1, tables[link_rules])
     alone = replace(arrays, pairs=np.empty((0, 2), np.int64))
@@ -315,8 +322,15 @@ class PathRisk:
         self.allowed = 0
         if config.max_risk is not None:
             self.allowed = tolerated_hits(config.max_risk, self._upper, config.n_worlds)
-            for ids in rules:
-                worlds.bake(without=ids)
+            worlds.sample()
+
+    def bounded_by(self, config: CheckerConfig) -> "PathRisk":
+        """Return the same with the bound of another config."""
+        other = copy.copy(self)
+        other.setting = replace(self.setting, config=config)
+        other._kept = replace(self._kept, config=config)
+        other.allowed = tolerated_hits(float(config.max_risk or 0.0), self._upper, config.n_worlds)
+        return other
 
     def tightened(self, level: int) -> "PathRisk | None":
         """Return the same with a stricter bound on verdicts, None if there is none left: halves

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vprism_plan._arguments import number
+from vprism_plan._arguments import choice, number
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning.attempts import Query, attempt, within_risk
 from vprism_plan.planning.goals import (
@@ -27,6 +27,14 @@ from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import CLOCKS, SearchRequest
 
 _log = logging.getLogger(__name__)
+
+# Answers by a checker within some seconds.
+Answer = Callable[[CheckerLike, float], PlanResult]
+
+MARGINS = (0.02, 0.01, 0.005, 0.0)  # metres beyond the checker's own, in turn
+_WIDER = 0.1  # of the time limit for each that is not the last
+_RISKIER = 0.2  # of the time limit to find out how risky what is too risky is, ...
+_BOUNDS = (0.25, 0.5, 0.75, 0.95)  # ... by these bounds, in turn
 
 
 def plan(
@@ -49,15 +57,17 @@ def plan(
     clock: str = "wall",
     objective: str | RiskObjective = "length",
     warm_start: bool = True,
-    margins: Sequence[float] | None = None,
+    margins: Sequence[float] | str | None = "auto",
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
     Start and goal are checked first. The path found is shortened, optionally resampled, and
     then every edge of the returned array is checked again with `checker.check_motion_report`.
     If the checker bounds the probability of collision (`max_risk`), the whole path is then
-    judged by worlds the search has not seen; one that is too risky is searched for again under
-    a tighter bound on its edges, within the time limit. Exceptions of the checker propagate.
+    judged by worlds the search has not seen: `result.risk`. One that is too risky is searched for
+    again under a tighter bound on its edges, within the time limit. If nothing is within the
+    bound, a fifth of the limit goes to the safest motion that is not: it is handed out as
+    `approximate_path` of a result that is "too_risky". Exceptions of the checker propagate.
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
@@ -99,10 +109,11 @@ def plan(
             their samples around the best path so far.
         margins: metres beyond the checker's own margin, decreasing, such as (0.02, 0.01,
             0.005, 0.0): with room to spare the path keeps away, in a narrow place it goes
-            through. The widest comes first, each with an equal share of the time that is left.
-            The first path is returned (its `message` names the margin), else the last answer.
-            Without 0 at the end, problems that only the checker's own margin allows stay
-            unsolved. The checker needs `with_extra_margin`.
+            through. The widest comes first, each wider one with a tenth of the time limit, the last
+            with what is left. The first path is returned (its `message` names the margin), else the
+            last answer. Without 0 at the end, problems that only the checker's own margin allows
+            stay unsolved. The checker needs `with_extra_margin`. "auto": those, if the checker has
+            it, for a short path by a planner that stops at its first; else none. None: none.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -141,19 +152,21 @@ def plan(
         found = replace(found, warnings=tuple(getattr(judge, "warnings", ())))
         return _annotated(found, judge, second_opinion, now)
 
-    if margins is None:
-        return answer(checker, request.time_limit)
-    return _widest(checker, margins, answer, request.time_limit, now)
+    if isinstance(margins, str):
+        choice("margins", margins, ("auto",), error=PlanningError)
+        first = stop == "first" or not planner_kind(planner).optimising
+        turns = objective == "length" and first and hasattr(checker, "with_extra_margin")
+        margins = MARGINS if turns else None
+    steps = [0.0] if margins is None else _checked_margins(checker, margins)
+    bounded = getattr(checker, "max_risk", None) is not None and hasattr(checker, "relaxed")
+    limit = request.time_limit
+    result = _widest(checker, steps, answer, (1.0 - bounded * _RISKIER) * limit, now)
+    if result.solved or not bounded or result.status == "too_risky":
+        return result
+    return _riskier(checker, result, answer, _RISKIER * limit)
 
 
-def _widest(
-    checker: Any,
-    margins: Sequence[float],
-    answer: Callable[[CheckerLike, float], PlanResult],
-    time_limit: float,
-    now: Now,
-) -> PlanResult:
-    """Return the answer with the widest margin that has a path, else the last answer."""
+def _checked_margins(checker: CheckerLike, margins: Sequence[float]) -> list[float]:
     steps = np.asarray(margins, dtype=np.float64)
     good = steps.ndim == 1 and len(steps) > 0 and steps[-1] >= 0.0 and steps[0] < np.inf
     if not (good and (np.diff(steps) < 0.0).all()):
@@ -162,17 +175,62 @@ def _widest(
     if not hasattr(checker, "with_extra_margin"):
         who = type(checker).__name__
         raise PlanningError(f"a {who} has no with_extra_margin; give a CollisionChecker")
+    return [float(step) for step in steps]
+
+
+def _widest(
+    checker: Any, margins: Sequence[float], answer: Answer, time_limit: float, now: Now
+) -> PlanResult:
+    """Return the answer with the widest margin that has a path, else the last answer."""
     left = time_limit
-    for k, step in enumerate(steps.tolist()):
+    for step in margins:
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
-        share = left / (len(steps) - k) if left > 0.0 else time_limit / len(steps)
+        share = max(left, _WIDER * time_limit)
         began = now()
-        result = answer(judge, share)
+        result = answer(judge, share if step == margins[-1] else _WIDER * time_limit)
         left -= now() - began
-        if result.solved:
+        if result.solved and len(margins) > 1:
             kept = f"{1000.0 * step:g} mm beyond the checker's margin"
             return replace(result, message=f"{result.message}; kept {kept}")
+        if result.solved:
+            break
     return result
+
+
+def _riskier(checker: Any, refused: PlanResult, answer: Answer, time_limit: float) -> PlanResult:
+    """Return the safest motion that is not within the bound on risk as "too_risky"; the answer
+    that is known, if there is none, or if what is in the way has been seen."""
+    most = checker.max_risk
+    bounds = [most, *(bound for bound in _BOUNDS if bound > most)]
+    for bound in bounds:
+        found = answer(checker.relaxed(bound), time_limit / len(bounds))
+        if found.solved:
+            risk = found.report.risk
+            said = f"only riskier motions were found than max_risk {most:g} allows"
+            if risk.upper <= most:
+                said = "the level set, rounded outward, is touched by less than it is unsure"
+            return replace(
+                found, status="too_risky", path=None, approximate_path=found.path,
+                explanation=refused.explanation,
+                message=f"{said}; the safest: {risk.text()}{_advice(risk)}",
+            )  # fmt: skip
+    if refused.status.startswith("invalid") and not found.status.startswith("invalid"):
+        what = refused.status.removeprefix("invalid_")
+        message = f"{what} is too risky, and no motion to it was found; {refused.message}"
+        return replace(refused, status="too_risky", message=message)
+    return refused
+
+
+def _advice(risk: Any) -> str:
+    """What would lower a risk, by what the worlds collide with first."""
+    if not risk.first_contact:
+        return ""
+    cause = risk.first_contact[0]
+    ways = "another view of it, or another goal,"
+    if cause.body.startswith("object:"):
+        allowed = f"{{{cause.link!r}: {{{cause.body.removeprefix('object:')}}}}}"
+        ways = f"another view of it, another goal, or allowed_contacts {allowed}"
+    return f"; {ways} would lower that"
 
 
 def _prepared(

@@ -69,7 +69,7 @@ class PlanReport:
             if nobody was asked or there is no path.
         second_opinion_time: seconds that took.
         risk: joint probability that the path collides, by worlds the search has not seen
-            (a `RiskEstimate`); None if the checker has no `max_risk`, or without a path.
+            (a `RiskEstimate`); None if the checker has no `max_risk`, or without any path.
         risk_levels: how often the bound was tightened: edges were within it, the path was not.
         risk_time: seconds spent on those estimates.
         allowed_contacts: permitted `Contact`s at the last waypoint.
@@ -123,8 +123,10 @@ class PlanResult:
             last row equals the goal up to whole turns of continuous joints.
         status: "exact" (path reaches the goal and every edge was re-verified),
             "approximate" (ended near the goal only), "timeout" (nothing found),
-            "invalid_start", "invalid_goal", "verification_failed", "too_risky" (every edge
-            is within `max_risk`, the whole path is not).
+            "invalid_start", "invalid_goal" (in collision, or out of the joint limits),
+            "verification_failed", "too_risky" (only motions, or ends, above `max_risk`, or nearer
+            to the level set than it is sure, were found; the safest is `approximate_path`, its
+            probability `risk`).
         report: the numbers.
         message: one line for people: what happened and why.
         approximate_path: waypoints that do NOT solve the query: approximate, refused by the
@@ -146,3 +148,9 @@ class PlanResult:
     def solved(self) -> bool:
         """True only if the path reaches the goal and was verified."""
         return self.status == "exact"
+
+    @property
+    def risk(self) -> Any:
+        """Joint probability that the path (or the least risky one, if that is too risky) collides:
+        `report.risk`, a `RiskEstimate`."""
+        return self.report.risk

@@ -247,7 +247,7 @@ def _default_costs(checker: Any, kept: float | None) -> Callable[[int], Trajecto
         return SumCost(
             *([smooth] if level == 0 else []),
             ClearanceCost(checker, margin=margin + _GROWTH * level, weight=_CLEAR),
-            *([] if config.max_risk is None else [risk(config.max_risk)]),
+            *([] if checker.max_risk is None else [risk(checker.max_risk)]),
             SelfCollisionCost(checker, margin=_APART, weight=_OWN),
             JointLimitCost(robot, margin=_LIMITS, weight=_WITHIN),
         )

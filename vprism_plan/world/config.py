@@ -191,11 +191,11 @@ class WorldConfig:
         resolution: distance between the nodes of the distance field.
         level: the objects are {x : P(occupied)(x) >= level}.
         occluded: what to do with space that a camera's ray would reach only through something it
-            saw. "occupied" (default): it is an obstacle, also where the map's kernels reach: a
-            posterior that extrapolates "empty" into a shadow can never make a hidden object
-            touchable. "posterior": where the map has support (kernel mass >= `min_support`), or its
-            prior has looked, the posterior decides; what lies farther from every object is judged
-            by `hidden_objects`. "free": only the posterior decides.
+            saw. "posterior" (default): where the map has support (kernel mass >= `min_support`), or
+            its prior has looked, the posterior decides; what lies farther from every object is
+            judged by `hidden_objects`. "occupied": it is an obstacle, also where the map's kernels
+            reach: nothing that hides can be touched, whatever its probability. "free": only the
+            posterior decides.
         hidden_objects: how many objects that nobody saw stand on a square metre of hidden support
             surface (policy "posterior"). Where the map has nothing to say, draws of the posterior
             hold so many of them, as cylinders 4 to 12 cm wide and 3 to 25 cm high, so bounds on
@@ -232,7 +232,7 @@ class WorldConfig:
 
     resolution: float = 0.01
     level: float = 0.5
-    occluded: OccludedPolicy = "occupied"
+    occluded: OccludedPolicy = "posterior"
     unobserved: UnobservedPolicy = "free"
     support: SupportExtent = "auto"
     bounds: Any = None

@@ -113,6 +113,20 @@ class Evidence:
                 len(nodes),
                 16,
             )
+        self._mark_seen(nodes, grid, objects, inner)
+        return Lattice(nodes, grid.first * CELLS, CELLS)
+
+    def with_all_seen(self, marks: Lattice, grid: Grid) -> Lattice:
+        """Return marks of the grid with all that was seen of the objects, as `marks` without their
+        distance gives them."""
+        nodes = marks.labels.copy()
+        self._mark_seen(nodes, grid, None, None)
+        return Lattice(nodes, marks.corner, CELLS)
+
+    def _mark_seen(
+        self, nodes: np.ndarray, grid: Grid, objects: Nodes | None, inner: Grid | None
+    ) -> None:
+        spacing = grid.spacing / CELLS
         for label, points, half in self._seen(grid, objects, 0.5 * spacing):
             kept: Any = slice(None)
             if inner is not None:
@@ -120,7 +134,6 @@ class Evidence:
             kernels.mark_boxes(
                 points[kept], half[kept], grid.origin, spacing, np.uint8(label), nodes
             )
-        return Lattice(nodes, grid.first * CELLS, CELLS)
 
     def _seen(self, grid: Grid, objects: Nodes | None, step: float) -> Iterator[Surface]:
         """Marks, points and half the widths of what was seen, the less important first: an

@@ -2,7 +2,7 @@
 """Objects that nobody saw, in hidden space of which no map says anything: a Boolean model."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -116,6 +116,19 @@ class UnseenObjects:
             places = floor @ plane.axes() + (plane.offset + height) * plane.normal
             floor = floor[_marked(mask, np.rint(places / grid.spacing).astype(np.int64) - first)]
         return cls(density, plane, grid.spacing, first, mask, floor)
+
+    def coarser(self, factor: int) -> "UnseenObjects":
+        """Return the same on voxels whose edge is a multiple of these, wherever one of these is."""
+        if factor == 1:
+            return self
+        index = np.floor((np.argwhere(self.mask) + self.first) / factor + 0.5).astype(np.int64)
+        first = index.min(axis=0)
+        mask = np.zeros(tuple(index.max(axis=0) - first + 1), dtype=bool)
+        mask[tuple((index - first).T)] = True
+        return replace(
+            self, density=self.density / factor**2, resolution=self.resolution * factor,
+            first=first, mask=mask,
+        )  # fmt: skip
 
     def draw(self, n_worlds: int, seed: int) -> Float[np.ndarray, "n 5"]:
         """Return the cylinders of some worlds: world, centre (two coordinates, metres along the

@@ -368,7 +368,8 @@ def without_fringe(found: Mask, others: Mask) -> Mask:
 
 
 def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
-    """Depth (metres) from which unlabelled clutter hides what is behind it, inf elsewhere.
+    """Depth (metres) from which unlabelled clutter, or the pictured robot, hides what is behind it,
+    inf elsewhere.
 
     A fringe that a mask left out hides what its object hides.
     """
@@ -376,4 +377,5 @@ def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -
     chosen = clutter_pixels(view, plane, config.background_height, config.lone_share, bounded)
     if view.labels is not None:
         chosen = without_fringe(chosen, view.labels > 0)
+    chosen = chosen | view.sees_robot
     return np.where(chosen, np.asarray(view.depth, dtype=np.float64), np.inf)

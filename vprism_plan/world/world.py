@@ -118,8 +118,7 @@ class World:
         self._said: tuple[str, ...] = ()
         self._lowered: World | None = None
         self._cache: dict[tuple[str, frozenset[int]], DistanceField] = {}
-        self._beyond_support: dict[bool, Lattice] = {}
-        self._draws: dict[tuple[int, int], PosteriorWorlds] = {}
+        self._draws: dict[tuple[int, int, float], PosteriorWorlds] = {}
         _log.debug("world baked: %s nodes, %s", self.field.distance.size, self.timings)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -268,31 +267,22 @@ class World:
             self._cache[key] = self._field([*parts, self._known], gone)
         return self._cache[key]
 
-    def certain_field(
-        self, without: Collection[int] = (), level_set: bool = False, seen: bool = False
-    ) -> DistanceField:
+    def certain_field(self, without: Collection[int] = (), seen: bool = False) -> DistanceField:
         """Distance to what is an obstacle whatever the posterior says: background, seen parts that
-        the level set misses, known geometry, unobserved space by its policy, and occluded space
-        where the map has too little support to judge (unless the policy is "free", or leaves it to
-        `WorldConfig.hidden_objects`). The rest is for `posterior_worlds` to say; with `level_set`,
-        the objects where P(occupied) >= level belong to it as well. The objects `without`, and
-        their seen parts, are left out. With `seen`, so does whatever was seen of an object,
-        wherever the level set is. WorldError if the map has no such object."""
+        the level set misses, known geometry, and unobserved and occluded space by their policies.
+        The rest is for `posterior_worlds` to say. The objects `without`, and their seen parts, are
+        left out. With `seen`, whatever was seen of an object belongs to it, wherever the level set
+        is. WorldError if the map has no such object."""
         gone = frozenset(classes_of(self.map, without))
-        key = (f"certain{' and level set' * level_set}{' and seen' * seen}", gone)
+        key = ("certain, all that was seen" if seen else "certain", gone)
         if key not in self._cache:
-            if seen not in self._beyond_support:
-                occluded = "free" if self.config.occluded == "free" else "posterior"
-                objects = None if seen else self._objects.distance
-                self._beyond_support[seen] = self._timed(
-                    "visibility beyond support", self._evidence.marks, occluded, self.grid, objects
-                )
-            marks = self._without(self._beyond_support[seen], gone)
-            parts = [*self._unseen_distances(marks), self._known]
-            if level_set:
-                parts.append(self._object_distances(self._rest(gone)))
-            self._cache[key] = self._field(parts, gone)
+            marks = self._without(self._all_seen if seen else self._unseen, gone)
+            self._cache[key] = self._field([*self._unseen_distances(marks), self._known], gone)
         return self._cache[key]
+
+    @cached_property
+    def _all_seen(self) -> Lattice:
+        return self._evidence.with_all_seen(self._unseen, self.grid)
 
     def source_field(self, name: str, without: Collection[int] = ()) -> DistanceField:
         """Distance to one of `sources` alone; baked on first use and kept.
@@ -346,18 +336,23 @@ class World:
         return finish(nodes, self.grid, self.sources, solid_outside, beyond)
 
     def posterior_worlds(
-        self, n_worlds: int = 256, seed: int = 0, reach: float = 0.2
+        self,
+        n_worlds: int = 256,
+        seed: int = 0,
+        reach: float = 0.2,
+        resolution: float | None = None,
     ) -> PosteriorWorlds:
-        """Return joint draws of the map on voxels of this world's resolution, as
-        `PosteriorWorlds` does, and of objects that nobody saw (`WorldConfig.hidden_objects`);
+        """Return joint draws of the map on voxels of this world's resolution, or a multiple of it,
+        as `PosteriorWorlds` does, and of objects that nobody saw (`WorldConfig.hidden_objects`);
         those with at least this reach are kept and shared."""
-        kept = self._draws.get((n_worlds, seed))
+        voxel = self.config.resolution if resolution is None else resolution
+        kept = self._draws.get((n_worlds, seed, voxel))
         if kept is None or kept.reach < reach:
-            kept = PosteriorWorlds(
-                self.map, n_worlds, seed, self.config.resolution, reach,
-                unseen=self._evidence.unseen,
-            )  # fmt: skip
-            self._draws[n_worlds, seed] = kept
+            unseen = self._evidence.unseen
+            if unseen is not None:
+                unseen = unseen.coarser(round(voxel / self.config.resolution))
+            kept = PosteriorWorlds(self.map, n_worlds, seed, voxel, reach, unseen=unseen)
+            self._draws[n_worlds, seed, voxel] = kept
         return kept
 
     def _without(self, marks: Lattice, classes: Collection[int]) -> Lattice:
