@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int, Int8, Int32, UInt8
+from jaxtyping import Bool, Float, Int, Int8, Int32, UInt8
 from scipy import ndimage
 from scipy.special import logit, logsumexp, ndtr
 
@@ -461,7 +461,7 @@ def _skippable(bound: Values, budget: float) -> Chosen:
     return skip
 
 
-def thresholds(n_worlds: int, n_objects: int, seed: int) -> Values:
+def thresholds(n_worlds: int, n_objects: int, seed: int) -> Float[np.ndarray, "s c"]:
     """Log-odds (S, C) that each draw adds to each object's: logistic, so that the share of draws
     above 0 is the probability; one from each of S equally probable parts, in an order of its own
     per object, and none beyond `_LEAST` on either side."""
