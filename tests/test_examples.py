@@ -36,11 +36,14 @@ def said_by(repository, saved_demo_map, tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_bound_on_risk_gives_a_less_risky_path_than_none(said_by):
     said = said_by("03")
-    straight, free, bounded = (float(p) for p in re.findall(r"P\(collision\) (\d\.\d+)", said))
+    found = re.findall(r"P\(collision\) (\d\.\d+)", said)
+    straight, free, bounded, risky = (float(p) for p in found)
     assert straight > 0.5
     assert bounded <= 0.05
     assert bounded <= free
     assert "max_risk 0.05: exact" in said
+    assert "too_risky: only riskier motions" in said
+    assert risky > 0.05
 
 
 @pytest.mark.slow

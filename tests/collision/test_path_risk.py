@@ -737,7 +737,7 @@ def test_a_tightened_checker_refuses_more_and_says_why(bounded, doubtful):
     assert level > 3
     assert refused > 0
     with pytest.raises(ConfigError, match="max_risk"):
-        CollisionChecker(checker.world, checker.robot, config()).tightened(1)
+        CollisionChecker(checker.world, checker.robot, config(max_risk=None)).tightened(1)
 
 
 def test_a_refusal_for_risk_names_links_objects_and_shares(bounded, doubtful):

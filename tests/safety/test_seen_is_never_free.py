@@ -110,7 +110,7 @@ def test_no_ball_on_a_seen_point_is_accepted(fitted, ball, occluded, bounds):
 def test_what_was_seen_outside_the_grid_has_a_name_and_no_clearance(kind, ball):
     view = observed(kind, seed=3)
     world = vp.World(vp.fit_map(view), vp.WorldConfig(occluded="free", bounds=SMALL))
-    checker = vp.CollisionChecker(world, ball)
+    checker = vp.CollisionChecker(world, ball, vp.CheckerConfig(max_risk=None))
     points, _ = view.points()
     post = points[(points[:, 0] > 0.6) & (points[:, 2] > 0.15) & (points[:, 2] < 0.2)]
     assert len(post) > 100
