@@ -785,7 +785,7 @@ def test_too_few_worlds_for_the_bound_are_refused(free_world, ball_robot):
     assert CollisionChecker(free_world, robot, config(max_risk=0.01, n_worlds=512)).max_risk == 0.01
 
 
-def test_worlds_without_a_posterior_are_refused():
+def test_worlds_without_a_posterior_are_refused(small):
     from oracles.checker_oracle import BallWorld
 
     arrays = random_arrays(np.random.default_rng(0), dof=2)
@@ -799,6 +799,9 @@ def test_worlds_without_a_posterior_are_refused():
     Q = np.random.default_rng(1).uniform(-3.0, 3.0, (300, 2))
     plain = CollisionChecker(world, as_robot(arrays), CheckerConfig(max_risk=None))
     np.testing.assert_array_equal(checker.is_valid_batch(Q), plain.is_valid_batch(Q))
+    # A world of one's own around a real map once was an error with every default.
+    world.map = small
+    assert CollisionChecker(world, as_robot(arrays)).max_risk is None
 
 
 def test_a_bound_on_risk_does_not_let_a_ball_shave_the_level_set(free_world, ball_robot, doubtful):

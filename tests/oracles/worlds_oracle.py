@@ -21,7 +21,7 @@ def draw_logits(map_, points, n_worlds, seed, thresholds=True):
     # Of S draws one per object and part of [0, 1]: u < sigmoid(z) occupies.
     rng = np.random.default_rng([seed, 0x10617])
     for k in range(1, logits.shape[2]):
-        u = np.clip((rng.permutation(n_worlds) + 0.5) / n_worlds, 1 / 128, 1 - 1 / 128)
+        u = np.clip((rng.permutation(n_worlds) + 0.5) / n_worlds, 1 / 512, 1 - 1 / 512)
         logits[known, :, k] += np.log(u) - np.log(1.0 - u)
     return logits
 

@@ -16,6 +16,7 @@ START, GOAL = [-0.7, -0.5], [0.7, -0.5]
 class Estimate:
     probability: float
     upper: float
+    first_contact: tuple[()] = ()
 
     def text(self):
         return f"P(collision) {self.probability:.3f}"
@@ -149,3 +150,17 @@ def test_without_a_bound_nobody_is_asked():
     assert result.solved
     assert checker.asked == []
     assert result.report.risk is None
+
+
+def test_what_even_a_looser_bound_calls_too_risky_is_still_shown():
+    """Found edge by edge, too risky as a whole: the answer was "timeout", and no path at all."""
+    closed = disk_world.closed_wall()
+    checker = RiskyDisks(closed, 0.1, 0.99, gain=1.0, levels=0)
+    checker.relaxed = lambda bound: RiskyDisks(
+        disk_world.wall_with_gap(), bound, 0.99, gain=1.0, levels=0
+    )
+    result = plan(checker, START, GOAL, time_limit=2.0)
+    assert result.status == "too_risky"
+    assert result.approximate_path is not None
+    assert result.risk.probability == 0.99
+    assert "riskier motions" in result.message

@@ -125,7 +125,7 @@ def _plan(command: _Parser) -> None:
     take("--goal-pose X Y Z QW QX QY QZ", float, text)
     take("--planner NAME", str, "OMPL planner; a name that is none lists them", "RRTConnect")
     take("--time-limit S", float, "wall time for the search, s", 5.0)
-    text = "clearance to keep, m; where there is room, the path keeps 5 to 20 mm more"
+    text = "clearance to keep, m; if there is room all along, the path keeps 5 to 20 mm more"
     take("--margin M", float, text, 0.0)
     _rules(command)
     take("--frame N", int, "image of a BOP scene; default the first")

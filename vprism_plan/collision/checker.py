@@ -83,9 +83,8 @@ class CollisionChecker(explain.Checker):
         self._lock = threading.Lock()
         self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
-        if self.config.max_risk is not None and hasattr(
-            getattr(world, "map", None), "sample_weights"
-        ):
+        posterior = hasattr(world, "certain_field") and hasattr(world.map, "sample_weights")
+        if self.config.max_risk is not None and posterior:
             self._bounded = self._risk()
             if self.config.max_risk >= world.config.level:
                 self._fields, self._world = self._what_was_seen

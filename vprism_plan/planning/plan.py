@@ -185,16 +185,15 @@ def _widest(
     left = time_limit
     for step in margins:
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
-        share = max(left, _WIDER * time_limit)
-        began = now()
-        result = answer(judge, share if step == margins[-1] else _WIDER * time_limit)
+        least, began = _WIDER * time_limit, now()
+        result = answer(judge, max(left, least) if step == margins[-1] else least)
         left -= now() - began
-        if result.solved and len(margins) > 1:
-            kept = f"{1000.0 * step:g} mm beyond the checker's margin"
-            return replace(result, message=f"{result.message}; kept {kept}")
         if result.solved:
             break
-    return result
+    if not result.solved or len(margins) == 1:
+        return result
+    kept = f"{1000.0 * step:g} mm beyond the checker's margin"
+    return replace(result, message=f"{result.message}; kept {kept}")
 
 
 def _riskier(checker: Any, refused: PlanResult, answer: Answer, time_limit: float) -> PlanResult:
@@ -204,13 +203,15 @@ def _riskier(checker: Any, refused: PlanResult, answer: Answer, time_limit: floa
     bounds = [most, *(bound for bound in _BOUNDS if bound > most)]
     for bound in bounds:
         found = answer(checker.relaxed(bound), time_limit / len(bounds))
-        if found.solved:
+        # What is too risky as a whole for this bound is so for the one that was asked for.
+        path = found.path if found.solved else found.approximate_path
+        if path is not None and found.report.risk is not None:
             risk = found.report.risk
             said = f"only riskier motions were found than max_risk {most:g} allows"
             if risk.upper <= most:
                 said = "the level set, rounded outward, is touched by less than it is unsure"
             return replace(
-                found, status="too_risky", path=None, approximate_path=found.path,
+                found, status="too_risky", path=None, approximate_path=path,
                 explanation=refused.explanation,
                 message=f"{said}; the safest: {risk.text()}{_advice(risk)}",
             )  # fmt: skip

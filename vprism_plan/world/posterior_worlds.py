@@ -24,7 +24,7 @@ from vprism_plan.world.unseen_objects import UnseenObjects
 MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits of the kernels
 _FINEST = 16.0  # stored steps per voxel, at most
 _MAX_VOXELS = 40_000_000
-_LEAST = 1.0 / 128.0  # P(occupied) below which no threshold makes a draw occupy a place
+_LEAST = 1.0 / 512.0  # P(occupied) below which no threshold makes a draw occupy a place
 _STREAM = 0x10617  # other random numbers than the weights'
 _GEMM_ROWS = 1024  # points per matrix product: their logits stay in the cache
 
