@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`plan` with a checker that bounds risk: the whole path counts, not its edges."""
 
+import time
 from dataclasses import dataclass
 
 import disk_world
@@ -164,3 +165,27 @@ def test_what_even_a_looser_bound_calls_too_risky_is_still_shown():
     assert result.approximate_path is not None
     assert result.risk.probability == 0.99
     assert "riskier motions" in result.message
+
+
+def test_drawing_worlds_under_a_wide_margin_leaves_the_last_one_its_time():
+    class SlowAtFirst(RiskyDisks):
+        """The first estimate takes longer than the whole plan may."""
+
+        def with_extra_margin(self, extra):
+            wider = SlowAtFirst(self, self.max_risk, 1.0)
+            wider.radii, wider.asked = self.radii + extra, self.asked
+            return wider
+
+        def tightened(self, level):
+            return None
+
+        def collision_probability(self, path, held_out=False):
+            if not self.asked:
+                time.sleep(0.6)
+            self.asked.append(0.0)
+            return Estimate(1.0, 1.0) if len(self.asked) == 1 else Estimate(0.0, 0.01)
+
+    checker = SlowAtFirst(disk_world.wall_with_gap(), 0.1, 1.0)
+    result = plan(checker, START, GOAL, margins=(0.01, 0.0), time_limit=0.5)
+    assert result.solved, result.message
+    assert result.report.time_limit > 0.3

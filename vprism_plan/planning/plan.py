@@ -181,13 +181,16 @@ def _checked_margins(checker: CheckerLike, margins: Sequence[float]) -> list[flo
 def _widest(
     checker: Any, margins: Sequence[float], answer: Answer, time_limit: float, now: Now
 ) -> PlanResult:
-    """Return the answer with the widest margin that has a path, else the last answer."""
+    """Return the answer with the widest margin that has a path, else the last answer.
+
+    As in `within_risk`, estimates (the first draws the worlds) do not count as time spent.
+    """
     left = time_limit
     for step in margins:
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
         least, began = _WIDER * time_limit, now()
         result = answer(judge, max(left, least) if step == margins[-1] else least)
-        left -= now() - began
+        left -= now() - began - result.report.risk_time
         if result.solved:
             break
     if not result.solved or len(margins) == 1:
