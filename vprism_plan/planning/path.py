@@ -9,9 +9,10 @@ be verified: same ends, same direction.
 import logging
 import math
 import time
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, Wayp
 from vprism_plan.planning.result import PlanReport, PlanResult
 
 Check = Callable[[np.ndarray, np.ndarray], bool]
+Edge = tuple[np.ndarray, np.ndarray]
 
 _log = logging.getLogger(__name__)
 
@@ -42,19 +44,20 @@ class MotionCheck:
     """
 
     def __init__(self, checker: CheckerLike) -> None:
-        self._check = checker.check_motion
+        self._check = checker.check_motion_buffer
         self._robot = checker.robot
-        self._turns = np.asarray(checker.robot.continuous, dtype=bool)
+        turns = np.asarray(checker.robot.continuous, dtype=bool)
+        self._turns = turns if turns.any() else None
         self.count = 0
 
     def __call__(self, qa: Configuration, qb: Configuration) -> bool:
         """Return whether the straight motion may become part of a path."""
         self.count += 1
-        if np.any(np.abs(qb - qa)[self._turns] >= np.pi):
+        if self._turns is not None and np.any(np.abs(qb - qa)[self._turns] >= np.pi):
             return False
-        if outside_limits(self._robot, np.stack([qa, qb]), _ROUNDING).any():
+        if not self._check(qa, qb):
             return False
-        return bool(self._check(qa, qb))
+        return not outside_limits(self._robot, np.stack([qa, qb]), _ROUNDING).any()
 
 
 def outside_limits(
@@ -79,16 +82,61 @@ def shorten(
     Both ends stay, and edges that were not in `path` passed `check`. The result depends on the
     clock only if the deadline strikes. With `cost`, only what does not raise it is taken.
     """
-    rng = np.random.default_rng(seed)
     path = drop_waypoints(path, check, deadline, now, cost)
+    cut, unchecked = _cuts(path, check, seed, deadline, now, cost, careful=False)
+    if not all(check(*edge) for edge in unchecked):
+        cut, _ = _cuts(path, check, seed, deadline, now, cost, careful=True)
+    return drop_waypoints(cut, check, deadline, now, cost)
+
+
+def _cuts(
+    path: Waypoints,
+    check: Check,
+    seed: int,
+    deadline: float,
+    now: Now,
+    cost: PathCost | None,
+    careful: bool,
+) -> tuple[Waypoints, list[Edge]]:
+    """Replace the path between two random points of it by straight motions, again and again.
+
+    A cut that ends within an edge leaves a piece of it, a new edge that has to pass by itself:
+    most pass, and most are gone after further cuts, so unless `careful` only the chords are
+    checked, and the pieces that are left returned.
+    """
+    rng = np.random.default_rng(seed)
+    unchecked: dict[tuple[bytes, bytes], Edge] = {}
+    along = _along(path)
     futile = 0
     for _ in range(_MOST_CUTS):
         if len(path) < 3 or futile >= _FUTILE_CUTS or now() > deadline:
             break
-        cut = _cut(path, check, rng, cost)
-        futile = futile + 1 if cut is None else 0
-        path = path if cut is None else cut
-    return drop_waypoints(path, check, deadline, now, cost)
+        futile += 1
+        first, second = sorted((along[-1] * rng.random(2)).tolist())
+        (i, a, first), (j, b, second) = _point(path, along, first), _point(path, along, second)
+        if i == j:
+            continue
+        start, end = path[i] if a is None else a, path[j] if b is None else b
+        if second - first - math.dist(start, end) < _WORTHWHILE * along[-1]:
+            continue
+        head, tail = path[: i + 1], path[j:] if b is None else path[j + 1 :]
+        shorter = np.concatenate([head, *(q[None] for q in (a, b) if q is not None), tail])
+        # Edges outside the cut are the same; compared as a whole, splitting one counts, too.
+        if not _no_dearer(cost, path, shorter) or not check(start, end):
+            continue
+        pieces = [] if a is None else [(head[-1], a)]
+        pieces += [] if b is None else [(b, tail[0])]
+        if careful and not all(check(*piece) for piece in pieces):
+            continue
+        unchecked.update(((p.tobytes(), q.tobytes()), (p, q)) for p, q in pieces)
+        path, along, futile = shorter, _along(shorter), 0
+    kept = ((p.tobytes(), q.tobytes()) for p, q in pairwise(path))
+    return path, [unchecked[edge] for edge in kept if edge in unchecked]
+
+
+def _along(path: Waypoints) -> list[float]:
+    """Arc length at each waypoint."""
+    return list(accumulate(map(math.dist, path[:-1], path[1:]), initial=0.0))
 
 
 def drop_waypoints(
@@ -120,41 +168,14 @@ def _no_dearer(cost: PathCost | None, old: Waypoints, new: Waypoints) -> bool:
     return cost is None or cost.path(new) <= cost.path(old)
 
 
-def _cut(
-    path: Waypoints, check: Check, rng: np.random.Generator, cost: PathCost | None
-) -> Waypoints | None:
-    """Try to replace the path between two random points of it by a straight motion."""
-    lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    along = np.concatenate([[0.0], np.cumsum(lengths)])
-    first, second = np.sort(rng.uniform(0.0, along[-1], 2))
-    i, a, first = _point(path, along, float(first))
-    j, b, second = _point(path, along, float(second))
-    if i == j:
-        return None
-    start = path[i] if a is None else a
-    end = path[j] if b is None else b
-    gain = second - first - float(np.linalg.norm(end - start))
-    if gain < _WORTHWHILE * along[-1]:
-        return None
-    rest = path[j:] if b is None else path[j + 1 :]
-    middle = [q[None] for q in (a, b) if q is not None]
-    shorter = np.concatenate([path[: i + 1], *middle, rest])
-    # Edges outside the cut are the same; compared as a whole, splitting one counts, too.
-    if not _no_dearer(cost, path, shorter) or not check(start, end):
-        return None
-    # Splitting an accepted edge makes new edges: they have to pass by themselves.
-    passed = (a is None or check(path[i], a)) and (b is None or check(b, path[j + 1]))
-    return shorter if passed else None
-
-
 def _point(
-    path: Waypoints, along: Float[np.ndarray, " t"], s: float
+    path: Waypoints, along: list[float], s: float
 ) -> tuple[int, Configuration | None, float]:
     """Edge that holds arc length s, the point there, s; near a waypoint its index, None, its s."""
-    nearest = int(np.argmin(np.abs(along - s)))
+    edge = min(bisect_right(along, s), len(along) - 1) - 1
+    nearest = edge + (along[edge + 1] - s < s - along[edge])
     if abs(along[nearest] - s) <= _SNAP * along[-1]:
-        return nearest, None, float(along[nearest])
-    edge = int(np.searchsorted(along, s, side="right")) - 1
+        return nearest, None, along[nearest]
     share = (s - along[edge]) / (along[edge + 1] - along[edge])
     return edge, path[edge] + share * (path[edge + 1] - path[edge]), s
 
