@@ -713,6 +713,57 @@ def test_edges_are_free_if_their_joint_risk_is_within_the_bound(bounded, doubtfu
 
 
 @pytest.mark.slow
+def is_proven(checker, qa, qb):
+    checker.check_motion(qa, qb)  # bakes
+    stats = np.empty(4)
+    return kernels.check_motion(qa, qb, *checker._far(), checker.config.min_motion, stats)
+
+
+def grown_by_what_is_kept(checker):
+    arrays = checker.robot.arrays
+    return arrays.__class__(**{**arrays.__dict__, "sphere_radius": checker._bounded._kept.radii})
+
+
+def test_what_keeps_clear_of_every_draw_touches_none(free_world, drawn, ball_robot):
+    checker = CollisionChecker(free_world, ball_robot(RADIUS), config(max_risk=0.3, margin=0.003))
+    rng = np.random.default_rng(5)
+    ends = rng.uniform([-0.15, -0.15, 0.025], [0.25, 0.15, 0.22], (24, 2, 3))
+    strictest = checker._bounded.allowed.bit_length() + 3
+    for judge in (checker, checker.tightened(strictest)):
+        arrays = grown_by_what_is_kept(judge)
+        proven = [edge for edge in ends if is_proven(judge, *edge)]
+        assert 0.1 * len(ends) < len(proven) < 0.9 * len(ends)
+        for edge in proven:
+            assert judge._bounded.accepts(edge)
+            assert not dense_touches(drawn, arrays, edge, H, step=0.002).any()
+            steps = np.linspace(0.0, 1.0, 50)[:, None]
+            Q = edge[0] + steps * (edge[1] - edge[0])
+            assert judge._bounded.accepts_each(Q).all()
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=seeds)
+def test_nor_does_a_random_robot(free_world, drawn, seed):
+    rng, arrays, checker, path = random_case(seed, free_world, max_risk=0.3)
+    aside = [random_q(rng, arrays) for _ in range(3)]
+    for edge in (*pairwise(path), *((q, q + 0.02 * (path[0] - q)) for q in aside)):
+        if is_proven(checker, *edge):
+            kept = grown_by_what_is_kept(checker)
+            assert not dense_touches(drawn, kept, edge, H, step=0.002).any()
+
+
+def test_nothing_is_proven_where_nobody_has_drawn(small, ball_robot):
+    """What is not baked yet counts as touched; asking about it bakes it."""
+    world = vp.World(small, vp.WorldConfig(occluded="free"))
+    checker = CollisionChecker(world, ball_robot(RADIUS), config(max_risk=0.3))
+    edges = np.random.default_rng(5).uniform([-0.15, -0.15, 0.025], [0.25, 0.15, 0.22], (40, 2, 3))
+    more, stats = checker.config.min_motion, np.empty(4)
+    before = [kernels.check_motion(*edge, *checker._far(), more, stats) for edge in edges]
+    after = [is_proven(checker, *edge) for edge in edges]
+    assert sum(before) < sum(after)
+    assert all(b for a, b in zip(before, after, strict=True) if a)
+
+
 def test_a_tightened_checker_refuses_more_and_says_why(bounded, doubtful):
     """Its reports once counted with the looser bound, and failed where that was not reached."""
     rng = np.random.default_rng(8)

@@ -314,7 +314,9 @@ def _annotated(
     if result.path is None:
         return result
     report, message = result.report, result.message
-    touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
+    touching: tuple[Any, ...] = ()
+    if getattr(getattr(checker, "config", None), "allowed_contacts", True):
+        touching = tuple(getattr(checker.explain(result.path[-1]), "allowed", ()))
     if touching:
         named = ", ".join(f"{contact.link} on {contact.body}" for contact in touching)
         report = replace(report, allowed_contacts=touching)
