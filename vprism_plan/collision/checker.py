@@ -124,7 +124,7 @@ class CollisionChecker(explain.Checker):
         self._lock = threading.Lock()
         self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
-        self._draws: _AnyDraw | None = None
+        self._draws: Any = None
         posterior = hasattr(world, "certain_field") and hasattr(world.map, "sample_weights")
         if self.config.max_risk is not None and posterior:
             self._bounded = self._risk()
@@ -327,7 +327,7 @@ class CollisionChecker(explain.Checker):
 
     def _far(self) -> tuple[Any, ...]:
         """What tells the kernels whether a motion keeps clear of every draw."""
-        assert self._bounded is not None and self._draws is not None
+        assert self._bounded is not None
         return self._draws.against(self._bounded._kept)
 
     def _check_motion(self, qa: np.ndarray, qb: np.ndarray, stats: np.ndarray) -> bool:

@@ -204,7 +204,10 @@ def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
 
 
 def configuration(robot: Any, q: Numbers) -> Configuration:
-    """Return a configuration; whether it is finite is for a verdict to say."""
+    """Return a configuration, itself if the kernels can read it; whether it is finite is for a
+    verdict to say."""
+    if type(q) is np.ndarray and q.dtype == np.float64 and q.shape == (robot.dof,):
+        return q if q.flags.carray else q.copy()
     array = joint_values(q, robot, "a configuration")
     if array.shape != (robot.dof,):
         raise _wrong_shape(robot, array, "a configuration", f"({robot.dof},)")
