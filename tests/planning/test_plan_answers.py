@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What `plan` answers with every default: how sure, how far away, and how risky its no is."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from oracles.small_scenes import at, small_map
 
 import vprism_plan as vp
-from vprism_plan.planning import plan
+from vprism_plan.planning import attempts, plan
+from vprism_plan.planning.attempts import Query
+from vprism_plan.planning.search import SearchOutcome
 from vprism_plan.world import Box
 
+NOTHING = SearchOutcome("timeout", None, None, 0.0, 0, 0)
 RADIUS = 0.02
 START = [0.02, -0.2, 0.15]
 ACROSS = [0.02, 0.2, 0.15]
@@ -49,12 +54,57 @@ def test_every_solved_plan_says_how_sure_it_is(checker):
 def test_with_room_to_spare_the_path_keeps_away(checker):
     low, across = [0.02, -0.2, 0.03], [0.02, 0.2, 0.03]
     result = plan(checker, low, across)
-    assert "kept 20 mm beyond the checker's margin" not in result.message  # the table is near
+    assert result.report.middle is not None  # the table is near
+    wide, first, last = result.report.middle
+    assert (wide, first, last) == (0.02, 1, len(result.path) - 2)
+    assert (
+        f"kept 20 mm beyond the checker's margin between waypoints 1 and {last}; 5 mm at both"
+        in (result.message)
+    )
+    assert checker.min_clearance(result.path[first : last + 1]).clearance > 0.0195
+    assert checker.min_clearance(result.path).clearance > 0.0045
     result = plan(checker, [*low[:2], 0.05], [*across[:2], 0.05])
     assert "kept 20 mm beyond the checker's margin" in result.message
+    assert result.report.middle is None
     assert checker.min_clearance(result.path).clearance > 0.0195
     plain = plan(checker, [*low[:2], 0.05], [*across[:2], 0.05], margins=None)
     assert checker.min_clearance(plain.path).clearance < 0.015
+
+
+def test_keeping_away_in_the_middle_never_makes_a_path_riskier(checker, monkeypatch):
+    rng = np.random.default_rng(7)
+    ends = rng.uniform([-0.15, -0.2, 0.022], [0.15, 0.2, 0.14], (400, 3))
+    ends = ends[checker.is_valid_batch(ends)]
+    widened = 0
+    for seed, pair in enumerate(ends[: len(ends) // 2 * 2].reshape(-1, 2, 3)[:40]):
+        result = plan(checker, *pair, seed=seed)
+        with monkeypatch.context() as patched:
+            patched.setattr(Query, "widened", lambda *_: None)
+            without = plan(checker, *pair, seed=seed)
+        assert result.solved or not without.solved
+        if result.report.middle is None:
+            continue
+        widened += 1
+        assert all(checker.check_motion(a, b) for a, b in pairwise(result.path))
+        again = checker.collision_probability(result.path, held_out=True)
+        assert again.probability == result.risk.probability
+        assert again.upper <= checker.config.max_risk
+        if without.solved and without.report.risk_levels == result.report.risk_levels:
+            assert result.risk.probability <= without.risk.probability
+    assert widened >= 5
+
+
+def test_shares_of_a_path_are_those_of_its_waypoints(checker):
+    rng = np.random.default_rng(8)
+    Q = rng.uniform([-0.3, -0.3, 0.0], [0.4, 0.3, 0.3], (300, 3))
+    told = [checker.explain(q).shares for q in Q]
+    for kind, shares in checker.unseen_shares(Q).items():
+        off = shares - [own[kind] for own in told]
+        assert np.abs(off).max() < 0.2  # one ball; a robot has dozens
+        assert np.abs(off).mean() < 0.02
+    result = plan(checker, START, ACROSS)
+    most = {k: v.max() for k, v in checker.unseen_shares(result.path).items()}
+    assert result.report.shares == most
 
 
 def test_a_wider_margin_draws_no_worlds_anew(checker):
@@ -76,7 +126,7 @@ def test_an_end_that_only_may_touch_is_too_risky_and_says_how_risky(checker, dou
         assert result.status == "too_risky"
         assert result.path is None
         if result.approximate_path is None:
-            assert "goal is too risky" in result.message
+            assert_says_how_risky(result.message, checker, q)
             continue
         np.testing.assert_array_equal(result.approximate_path[-1], q)
         assert ("riskier motions" in result.message) == (result.risk.upper > 0.1)
@@ -84,6 +134,26 @@ def test_an_end_that_only_may_touch_is_too_risky_and_says_how_risky(checker, dou
         assert not result.explanation.valid
         told += "another view of it, another goal, or allowed_contacts {'ball': {" in result.message
     assert told >= 2
+
+
+def assert_says_how_risky(message, checker, q):
+    risk = checker.collision_probability(q, held_out=True)
+    assert f"goal is too risky, {risk.text()}, and no motion to it was found" in message
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_without_a_motion_the_goal_s_own_probability_is_told(
+    checker, doubtful, several, monkeypatch
+):
+    goals = doubtful[[0, len(doubtful) // 2]] if several else doubtful[0]
+    monkeypatch.setattr(attempts, "search", lambda *_: NOTHING)
+    monkeypatch.setattr(type(checker), "check_motion", lambda *_: False)
+    result = plan(checker, START, goals)
+    assert result.status == "too_risky"
+    assert result.approximate_path is None
+    risks = [checker.collision_probability(q, held_out=True) for q in np.atleast_2d(goals)]
+    best = np.atleast_2d(goals)[int(np.argmin([risk.upper for risk in risks]))]
+    assert_says_how_risky(result.message, checker, best)
 
 
 def test_an_end_in_what_was_seen_or_is_known_is_in_collision(checker, world):

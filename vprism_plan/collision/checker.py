@@ -261,7 +261,6 @@ class CollisionChecker(explain.Checker):
         other = self._with(
             config=replace(self.config, margin=self.config.margin + extra),
             _world=_wider(self._world, extra),
-            _surfaces=_wider(self._surfaces, extra),
         )
         vars(other).pop("_what_was_seen", None)  # packed with the margin
         return other

@@ -8,14 +8,22 @@ risky although each of its edges is within the bound (`within_risk`): then it is
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, pairwise
 from typing import Any
 
 import numpy as np
 
 from vprism_plan.planning.objectives import PathCost
 from vprism_plan.planning.ompl_adapter import nearest_turns
-from vprism_plan.planning.path import MotionCheck, cheapen, resample, shorten, verified
+from vprism_plan.planning.path import (
+    MotionCheck,
+    cheapen,
+    drop_waypoints,
+    interpolated,
+    resample,
+    shorten,
+    verified,
+)
 from vprism_plan.planning.planners import planner_kind
 from vprism_plan.planning.protocols import CheckerLike, Now, Waypoints
 from vprism_plan.planning.result import Improvement, PlanReport, PlanResult
@@ -28,6 +36,8 @@ Lead = tuple[int | None, np.ndarray]
 
 _SEARCHES = 5
 _LEAD_SHARE = 0.1  # of the time limit that shortening a leading path may take
+_RETREAT = 0.05  # joint space; how finely a place with room for a margin is looked for
+_RETREAT_CHECKS = 200  # motions between such places, all margins together; 3 to 23 found a way
 _SEED_STRIDE = 0x9E3779B1
 
 
@@ -55,14 +65,16 @@ def within_risk(
         if judge is None or (level and left <= 0.0):
             break
         result, tried = attempt(judge, left, level), level
+        spent += result.report.risk_time
         if not result.solved:
             if best is None:
                 return result
             break
-        asked = now()
-        risk = bounded.collision_probability(result.path, held_out=True)
-        spent += now() - asked
-        report = replace(result.report, risk=risk, risk_levels=level, risk_time=spent)
+        if result.report.risk is None:
+            result = _with_risk(bounded, result, now)
+            spent += result.report.risk_time
+        risk = result.report.risk
+        report = replace(result.report, risk_levels=level, risk_time=spent)
         if risk.upper <= max_risk:
             return replace(result, report=report, message=f"{result.message}; {risk.text()}")
         if best is None or risk.upper < best.report.risk.upper:
@@ -79,6 +91,14 @@ def within_risk(
     )
 
 
+def _with_risk(bounded: Any, result: PlanResult, now: Now) -> PlanResult:
+    """Return the result with the risk of its path by worlds that the search has not seen."""
+    asked = now()
+    risk = bounded.collision_probability(result.path, held_out=True)
+    report = replace(result.report, risk=risk, risk_time=result.report.risk_time + now() - asked)
+    return replace(result, report=report)
+
+
 @dataclass(frozen=True)
 class Query:
     """What is looked for, and what is done to a path that is found; see `plan`."""
@@ -92,6 +112,85 @@ class Query:
     simplify_time: float
     interpolate: float | None
     clearance_step: float
+    wider: tuple[float, ...] = ()  # metres beyond the checker's margin to keep between the ends
+
+    def finished(self, checker: CheckerLike, path: Waypoints, report: PlanReport) -> PlanResult:
+        """Return the verdict on a path that was found, shortened.
+
+        Where an end is too near to something for a wider margin, that is kept between the ends,
+        unless the path is riskier then.
+        """
+        away = self.widened(checker, path, report) if self.simplify and self.cost is None else None
+        wide = None if away is None else self.verified(checker, *away)
+        if wide is None or not wide.solved:
+            return self.verified(checker, *self.shortened(checker, path, report))
+        if getattr(checker, "max_risk", None) is None:
+            return wide
+        wide = _with_risk(checker, wide, self.request.now)
+        if wide.risk.probability == 0.0:  # no other can be less risky
+            return wide
+        result = self.verified(checker, *self.shortened(checker, path, report))
+        if result.solved:
+            result = _with_risk(checker, result, self.request.now)
+        least = not result.solved or wide.risk.probability <= result.risk.probability
+        best, other = (wide, result) if least else (result, wide)
+        spent = best.report.risk_time + other.report.risk_time
+        return replace(best, report=replace(best.report, risk_time=spent))
+
+    def widened(
+        self, checker: Any, path: Waypoints, report: PlanReport
+    ) -> tuple[Waypoints, PlanReport] | None:
+        """Return a path that keeps a wider margin between its tight ends, and the report.
+
+        From each end the path is followed to where there is room; between these places another
+        is searched for, that keeps the margin. None if there is no such place, or no such path.
+        """
+        now, seed = self.request.now, report.seed
+        began, spent = now(), report.planning_time
+        end = began + self.simplify_time
+        check = MotionCheck(checker)
+        checks, most = report.motion_checks, _RETREAT_CHECKS
+        rows: np.ndarray | None = None
+        for extra in self.wider:
+            judge = checker.with_extra_margin(extra)
+            if most <= 0 or (judge.is_valid(path[0]) and judge.is_valid(path[-1])):
+                break  # the ends are not what is in the way
+            if rows is None:
+                rows = interpolated(drop_waypoints(path, check, end, now), _RETREAT)
+            first = next((i for i, q in enumerate(rows) if judge.is_valid(q)), len(rows))
+            last = next((i for i in reversed(range(len(rows))) if judge.is_valid(rows[i])), 0)
+            if first >= last:
+                continue
+            quick = replace(
+                self.request, planner="RRTConnect", stop="first", step=None, seed=seed,
+                most_checks=most,
+            )  # fmt: skip
+            middle, keeps = rows[[first, last]], MotionCheck(judge)
+            if not keeps(*middle):
+                found = search(judge, rows[first], rows[last:][:1], quick)
+                spent, checks = spent + found.planning_time, checks + found.motion_checks
+                most -= found.motion_checks
+                if found.status != "exact" or found.path is None:
+                    continue
+                middle = shorten(found.path, keeps, seed, end, now)
+            kept = all(keeps(a, b) for a, b in pairwise(middle))
+            checks += keeps.count
+            if not kept:
+                continue
+            head, tail = (
+                drop_waypoints(q, check, end, now) for q in (rows[: first + 1], rows[last:])
+            )
+            # The middle may have gone round the other way.
+            turns = np.round((middle[-1] - rows[last]) / (2.0 * np.pi))
+            whole = np.concatenate([head[:-1], middle, tail[1:] + 2.0 * np.pi * turns])
+            took = report.simplification_time + now() - began - (spent - report.planning_time)
+            report = replace(
+                report, direct=False, planning_time=spent, simplification_time=took,
+                motion_checks=checks + check.count,
+                middle=(extra, len(head) - 1, len(head) + len(middle) - 2),
+            )  # fmt: skip
+            return whole, report
+        return None
 
     def shortened(
         self, checker: CheckerLike, path: Waypoints, report: PlanReport
@@ -114,7 +213,12 @@ class Query:
     def verified(self, checker: CheckerLike, path: Waypoints, report: PlanReport) -> PlanResult:
         """Return the verdict on a path with the waypoints that were asked for."""
         if self.interpolate is not None:
+            bends = path
             path = resample(path, MotionCheck(checker), self.interpolate)
+            if report.middle is not None:
+                extra, *ends = report.middle
+                first, last = (int((path == bends[i]).all(axis=1).argmax()) for i in ends)
+                report = replace(report, middle=(extra, first, last))
         return verified(checker, path, self.clearance_step, report, self.request.now)
 
 
@@ -135,7 +239,7 @@ def attempt(
     lead = next(straight, None)
     # Nothing is shorter. Only if it risks nothing, nothing is cheaper.
     if lead is not None and (query.cost is None or query.cost.risk.motion(*lead[1]) == 0.0):
-        return query.verified(checker, lead[1], replace(report, direct=True, goal_index=lead[0]))
+        return query.finished(checker, lead[1], replace(report, direct=True, goal_index=lead[0]))
     seed = _other_seed(query.request.seed, 64 * number)
     query = replace(query, request=replace(query.request, time_limit=time_limit, seed=seed))
     return searched(checker, query, report, lead)
@@ -167,8 +271,7 @@ def searched(
         )
         if found.status != "exact" or found.path is None:
             return refused or not_found(found.status, found.path, report)
-        path, report = query.shortened(checker, found.path, report)
-        result = query.verified(checker, path, replace(report, goal_index=found.goal_index))
+        result = query.finished(checker, found.path, replace(report, goal_index=found.goal_index))
         if result.solved:
             return result
         refused, report = result, result.report

@@ -218,7 +218,7 @@ def _distinct(
 
 def configuration(q: Any, robot: Any, what: str) -> Configuration:
     """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
-    array = _numbers(q, robot, what)
+    array = numbers(q, robot, what)
     if array.shape != (robot.dof,):
         joints = f"({robot.dof},), one value per joint: {', '.join(robot.joint_names)}"
         raise PlanningError(f"{what} has shape {array.shape}; it must be {joints}")
@@ -227,7 +227,8 @@ def configuration(q: Any, robot: Any, what: str) -> Configuration:
     return array
 
 
-def _numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
+def numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
+    """Return values as a fresh float64 array of any shape; PlanningError if they are not."""
     try:
         return joint_values(values, robot, what)
     except RobotError as error:
@@ -263,7 +264,7 @@ def valid_goals(
 ) -> tuple[Float[np.ndarray, "g dof"], PlanReport] | PlanResult:
     """Return valid goal configurations (g, dof) and the report of the others, or the refusal."""
     robot = checker.robot
-    array = np.empty(0) if isinstance(goal, ReachRegion) else _numbers(goal, robot, "goal")
+    array = np.empty(0) if isinstance(goal, ReachRegion) else numbers(goal, robot, "goal")
     if isinstance(goal, ReachRegion):
         what, found = "region", solve_region(robot, goal, start, report.seed, config)
     elif array.shape == (4, 4) and (robot.dof != 4 or array[3].tolist() == [0.0, 0.0, 0.0, 1.0]):

@@ -16,6 +16,7 @@ from vprism_plan.planning.goals import (
     PoseGoalConfig,
     ReachRegion,
     configuration,
+    numbers,
     refuse,
     valid_goals,
 )
@@ -28,10 +29,11 @@ from vprism_plan.planning.search import CLOCKS, SearchRequest
 
 _log = logging.getLogger(__name__)
 
-# Answers by a checker within some seconds.
-Answer = Callable[[CheckerLike, float], PlanResult]
+# Answers by a checker within some seconds; in the middle of a path keeping one of more margins.
+Answer = Callable[[CheckerLike, float, tuple[float, ...]], PlanResult]
 
 MARGINS = (0.02, 0.01, 0.005, 0.0)  # metres beyond the checker's own, in turn
+_BEYOND = " beyond the checker's margin"
 _WIDER = 0.1  # of the time limit for each that is not the last
 _RISKIER = 0.2  # of the time limit to find out how risky what is too risky is, ...
 _BOUNDS = (0.25, 0.5, 0.75, 0.95)  # ... by these bounds, in turn
@@ -110,10 +112,12 @@ def plan(
         margins: metres beyond the checker's own margin, decreasing, such as (0.02, 0.01,
             0.005, 0.0): with room to spare the path keeps away, in a narrow place it goes
             through. The widest comes first, each wider one with a tenth of the time limit, the last
-            with what is left. The first path is returned (its `message` names the margin), else the
-            last answer. Without 0 at the end, problems that only the checker's own margin allows
-            stay unsolved. The checker needs `with_extra_margin`. "auto": those, if the checker has
-            it, for a short path by a planner that stops at its first; else none. None: none.
+            with what is left. The first path is returned, else the last answer. Where only an end
+            is too near for a wider margin, that is kept between the ends if it makes the path no
+            riskier; `message` and `report.middle` say what was kept where. Without 0 at the end,
+            problems that only the checker's own margin allows stay unsolved. The checker needs
+            `with_extra_margin`. "auto": those, if the checker has it, for a short path by a planner
+            that stops at its first; else none. None: none.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -131,14 +135,14 @@ def plan(
     q_start = configuration(start, checker.robot, "start")
     now = CLOCKS[clock]
 
-    def answer(judge: CheckerLike, limit: float) -> PlanResult:
+    def answer(judge: CheckerLike, limit: float, wider: tuple[float, ...] = ()) -> PlanResult:
         asked = replace(request, time_limit=limit)
         found = _prepared(judge, q_start, goal, pose_goal, asked, objective, now)
         if not isinstance(found, PlanResult):
             goals, cost, report = found
             query = Query(
                 q_start, goals, asked, cost, warm_start and stop != "first", simplify,
-                float(simplify_time), interpolate, clearance_step,
+                float(simplify_time), interpolate, clearance_step, wider,
             )  # fmt: skip
             found = within_risk(
                 judge,
@@ -160,10 +164,14 @@ def plan(
     steps = [0.0] if margins is None else _checked_margins(checker, margins)
     bounded = getattr(checker, "max_risk", None) is not None and hasattr(checker, "relaxed")
     limit = request.time_limit
-    result = _widest(checker, steps, answer, (1.0 - bounded * _RISKIER) * limit, now)
+    ends = [q_start]
+    if not isinstance(goal, ReachRegion):
+        values = numbers(goal, checker.robot, "goal")
+        ends += [configuration(values, checker.robot, "goal")] if values.ndim == 1 else []
+    result = _widest(checker, steps, ends, answer, (1.0 - bounded * _RISKIER) * limit, now)
     if result.solved or not bounded or result.status == "too_risky":
         return result
-    return _riskier(checker, result, answer, _RISKIER * limit)
+    return _riskier(checker, result, ends, answer, _RISKIER * limit)
 
 
 def _checked_margins(checker: CheckerLike, margins: Sequence[float]) -> list[float]:
@@ -179,7 +187,12 @@ def _checked_margins(checker: CheckerLike, margins: Sequence[float]) -> list[flo
 
 
 def _widest(
-    checker: Any, margins: Sequence[float], answer: Answer, time_limit: float, now: Now
+    checker: Any,
+    margins: Sequence[float],
+    ends: Sequence[Configuration],
+    answer: Answer,
+    time_limit: float,
+    now: Now,
 ) -> PlanResult:
     """Return the answer with the widest margin that has a path, else the last answer.
 
@@ -188,24 +201,42 @@ def _widest(
     left = time_limit
     for step in margins:
         judge = checker.with_extra_margin(step) if step > 0.0 else checker
+        if step != margins[-1] and not all(map(judge.is_valid, ends)):
+            continue  # only the last refusal is told, and telling takes longer than a search
         least, began = _WIDER * time_limit, now()
-        result = answer(judge, max(left, least) if step == margins[-1] else least)
+        wider = tuple(other - step for other in margins if other > step)
+        result = answer(judge, max(left, least) if step == margins[-1] else least, wider)
         left -= now() - began - result.report.risk_time
         if result.solved:
             break
     if not result.solved or len(margins) == 1:
         return result
-    kept = f"{1000.0 * step:g} mm beyond the checker's margin"
-    return replace(result, message=f"{result.message}; kept {kept}")
+    report, kept = result.report, f"{1000.0 * step:g} mm"
+    if report.middle is None:
+        return replace(result, message=f"{result.message}; kept {kept}{_BEYOND}")
+    extra, first, last = report.middle
+    where = "at both ends" if first > 0 else "at the end"
+    where = "at the start" if last == report.waypoints - 1 else where
+    wide = f"{1000.0 * (step + extra):g} mm{_BEYOND} between waypoints {first} and {last}"
+    message = f"{result.message}; kept {wide}; {kept} {where}"
+    return replace(
+        result, report=replace(report, middle=(step + extra, first, last)), message=message
+    )
 
 
-def _riskier(checker: Any, refused: PlanResult, answer: Answer, time_limit: float) -> PlanResult:
+def _riskier(
+    checker: Any,
+    refused: PlanResult,
+    ends: Sequence[Configuration],
+    answer: Answer,
+    time_limit: float,
+) -> PlanResult:
     """Return the safest motion that is not within the bound on risk as "too_risky"; the answer
     that is known, if there is none, or if what is in the way has been seen."""
     most = checker.max_risk
     bounds = [most, *(bound for bound in _BOUNDS if bound > most)]
     for bound in bounds:
-        found = answer(checker.relaxed(bound), time_limit / len(bounds))
+        found = answer(checker.relaxed(bound), time_limit / len(bounds), ())
         # What is too risky as a whole for this bound is so for the one that was asked for.
         path = found.path if found.solved else found.approximate_path
         if path is not None and found.report.risk is not None:
@@ -220,7 +251,14 @@ def _riskier(checker: Any, refused: PlanResult, answer: Answer, time_limit: floa
             )  # fmt: skip
     if refused.status.startswith("invalid") and not found.status.startswith("invalid"):
         what = refused.status.removeprefix("invalid_")
-        message = f"{what} is too risky, and no motion to it was found; {refused.message}"
+        asked = ends[:1] if what == "start" else ends[1:]
+        asked = asked or [np.array(goal.q) for goal in refused.report.refused_goals]
+        known = [checker.collision_probability(q, held_out=True) for q in asked]
+        risk = min(known, key=lambda estimate: estimate.upper)
+        message = (
+            f"{what} is too risky, {risk.text()}, and no motion to it was found; "
+            f"{refused.message}{_advice(risk)}"
+        )
         return replace(refused, status="too_risky", message=message)
     return refused
 

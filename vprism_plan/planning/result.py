@@ -73,6 +73,8 @@ class PlanReport:
         risk_levels: how often the bound was tightened: edges were within it, the path was not.
         risk_time: seconds spent on those estimates.
         allowed_contacts: permitted `Contact`s at the last waypoint.
+        middle: a wider margin (metres beyond the checker's) than near an end, and the waypoints
+            between which the path keeps it; None if it is the same all along.
         clock: what all these seconds were measured by: "wall" or "process" (processor time).
         objective: what the search made small: "length", or the kind of risk.
         objective_time: seconds that preparing it took: worlds drawn and baked, the first time.
@@ -106,6 +108,7 @@ class PlanReport:
     risk_levels: int = 0
     risk_time: float = 0.0
     allowed_contacts: tuple[Any, ...] = ()
+    middle: tuple[float, int, int] | None = None
     clock: str = "wall"
     objective: str = "length"
     objective_time: float = 0.0

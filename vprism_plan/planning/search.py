@@ -65,6 +65,7 @@ class SearchRequest:
     convergence: tuple[float, int]
     step: float | None
     clock: str
+    most_checks: int | None = None  # motions after which RRTConnect gives up, in time or not
 
     def __post_init__(self) -> None:
         kind = planner_kind(self.planner)
@@ -155,7 +156,7 @@ def search(
         reader = StateReader(space, len(start))
         began = request.now()
         if held is None:
-            status, history = _solve(planner, problem, reader, start, request, guided)
+            status, history = _solve(planner, problem, reader, start, request, guided, motions)
         else:
             status, history = held.solve(planner, time_is_up(request.clock, request.time_limit)), ()
         took = request.now() - began
@@ -204,6 +205,7 @@ def _solve(
     start: Configuration,
     request: SearchRequest,
     guided: GuidedGoal | None,
+    motions: VPrismMotionValidator,
 ) -> tuple[Any, tuple[Improvement, ...]]:
     """Run the planner until it is done or has to stop; note every better path on the way."""
     kind = planner_kind(request.planner)
@@ -211,7 +213,11 @@ def _solve(
     began = now()
     end = began + request.time_limit
     if not (kind.optimising and kind.reports_cost):
-        return planner.solve(time_is_up(request.clock, request.time_limit)), ()
+        timed, most = time_is_up(request.clock, request.time_limit), request.most_checks
+        if most is not None:
+            enough = ob.PlannerTerminationCondition(lambda: motions.checks >= most)
+            timed = ob.plannerOrTerminationCondition(timed, enough)
+        return planner.solve(timed), ()
     progress = _Progress(planner, request, kind)
     history: list[Improvement] = []
     idle = 0
