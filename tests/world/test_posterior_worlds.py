@@ -391,7 +391,7 @@ def test_the_level_counts_all_objects_together():
     np.testing.assert_array_equal(owners_of(logits)[0], [1, 0, 2])
     from vprism_plan._kernels.risk import classify
 
-    out, odds = np.empty((1, 3), np.uint8), np.empty((1, 3), np.int8)
-    classify(logits.reshape(1, -1), 3, 3, out, odds)
-    np.testing.assert_array_equal(out[0], [1, 0, 2])
-    np.testing.assert_array_equal(odds[0], [7, -16, 6])
+    out, odds = np.empty(3, np.uint8), np.empty(3, np.int8)
+    classify(logits[0].T.astype(np.float32), out, odds)
+    np.testing.assert_array_equal(out, [1, 0, 2])
+    np.testing.assert_array_equal(odds, [7, -16, 6])

@@ -22,6 +22,7 @@ Tables (see `vprism_plan.world.posterior_worlds`):
 import numpy as np
 
 from vprism_plan._kernels.jit import njit
+from vprism_plan._kernels.mapping import _near_box as near_box
 
 FREE = np.int32(-2)
 UNBAKED = np.int32(-1)
@@ -35,30 +36,118 @@ _FAR = np.uint16(40000)  # above any squared distance within reach, and twice th
 
 
 @njit(cache=True, nogil=True)
-def classify(logits, n_draws, n_classes, out, odds):
-    """Which object occupies each voxel in each draw: out (n, S), from logits (n, S * K), and
-    the log-odds of that, odds (n, S).
+def draw_voxels(
+    points, hinges, cell_start, cell_items, grid_lower, cell, shape, radius, gamma,
+    prior, own, weights, used, thresholds, owners, odds, start, stop,
+):  # fmt: skip
+    """Which object occupies the points start..stop in each draw, and the log-odds of that: owners
+    and odds (n, S).
+
+    Logits are prior (n, K), and the features times weights (M, K, S), of which those not in used
+    (M, K) are 0; where own (n,), thresholds (K, S) are added. A point's bits do not depend on the
+    others. Single precision: off by some 1e-6 nats.
+    """
+    n_features, n_classes, n_draws = weights.shape
+    near = np.empty(n_features, np.int64)
+    mine = np.empty(n_features, np.int64)
+    phi = np.empty(n_features, np.float32)
+    feature = np.empty(n_features, np.float32)
+    logits = np.empty((n_classes, n_draws), np.float32)
+    for i in range(start, stop):
+        count = near_box(
+            points[i], points[i], hinges, cell_start, cell_items, grid_lower, cell, shape, radius,
+            near,
+        )  # fmt: skip
+        for u in range(count):
+            away = 0.0
+            for a in range(3):
+                away += (points[i, a] - hinges[near[u], a]) ** 2
+            phi[u] = np.exp(-gamma * away)
+        for k in range(n_classes):
+            row, bias = logits[k], weights[n_features - 1, k]
+            for s in range(n_draws):
+                row[s] = np.float32(prior[i, k]) + bias[s]
+            if own[i]:
+                for s in range(n_draws):
+                    row[s] += thresholds[k, s]
+            some = 0
+            for u in range(count):
+                if used[near[u], k]:
+                    mine[some], feature[some] = near[u], phi[u]
+                    some += 1
+            for u in range(some, some + -some % 4):  # four at a time: sums stay in registers
+                mine[u], feature[u] = n_features - 1, 0.0
+            for u in range(0, some, 4):
+                w0, w1 = weights[mine[u], k], weights[mine[u + 1], k]
+                w2, w3 = weights[mine[u + 2], k], weights[mine[u + 3], k]
+                f0, f1, f2, f3 = feature[u], feature[u + 1], feature[u + 2], feature[u + 3]
+                for s in range(n_draws):
+                    row[s] += (f0 * w0[s] + f1 * w1[s]) + (f2 * w2[s] + f3 * w3[s])
+        classify(logits, owners[i], odds[i])
+
+
+@njit(cache=True, nogil=True)
+def classify(logits, owners, odds):
+    """Which object occupies a voxel in each draw: owners (S,), from logits (K, S), and the
+    log-odds of that, odds (S,).
 
     Occupied where 1 - softmax(z)_0 > 1/2, which is sum_{k >= 1} exp(z_k - z_0) > 1; by
     the likeliest object.
     """
-    for i in range(logits.shape[0]):
+    n_classes, n_draws = logits.shape
+    best, total = logits[1].copy(), np.zeros(n_draws, np.float32)
+    owners[:] = 1
+    for k in range(2, n_classes):
+        row = logits[k]
         for s in range(n_draws):
-            o = s * n_classes
-            empty = logits[i, o]
-            best = 1
-            for k in range(2, n_classes):
-                if logits[i, o + k] > logits[i, o + best]:
-                    best = k
-            gap = logits[i, o + best] - empty
-            if n_classes > 2 and abs(gap) * ODDS < MOST_ODDS:
-                total = 0.0
-                for k in range(1, n_classes):
-                    total += np.exp(logits[i, o + k] - empty)
-                gap = np.log(total)
-            steps = min(max(np.rint(abs(gap) * ODDS), 1.0), MOST_ODDS)
-            out[i, s] = best if gap > 0.0 else 0
-            odds[i, s] = steps if gap > 0.0 else -steps
+            if row[s] > best[s]:
+                owners[s] = k
+            best[s] = max(best[s], row[s])
+    if n_classes > 2:
+        power = np.empty(n_draws, np.int32)
+        for k in range(1, n_classes):
+            _add_exp(logits[k], best, power, power.view(np.float32), total)
+    for s in range(n_draws):
+        gap = best[s] - logits[0, s]
+        if n_classes > 2 and abs(gap) * ODDS < MOST_ODDS:
+            gap += np.log(total[s])
+        steps = min(max(np.rint(abs(gap) * ODDS), 1.0), MOST_ODDS)
+        odds[s] = steps if gap > 0.0 else -steps
+        if gap <= 0.0:
+            owners[s] = 0
+
+
+@njit(cache=True, nogil=True)
+def _add_exp(row, best, bits, power, total):
+    """total (S,) += exp(row - best), which is at most 1, to 2e-7: Moshier, "Cephes" (expf), in
+    loops that run on vectors. bits, and the same memory as power: scratch."""
+    for s in range(row.size):
+        x = max(row[s] - best[s], np.float32(-80.0))
+        n = np.floor(np.float32(1.44269504) * x + np.float32(0.5))
+        x = (x - n * np.float32(0.693359375)) + n * np.float32(2.12194440e-4)
+        p = np.float32(1.9875691500e-4) * x + np.float32(1.3981999507e-3)
+        p = p * x + np.float32(8.3334519073e-3)
+        p = p * x + np.float32(4.1665795894e-2)
+        p = p * x + np.float32(1.6666665459e-1)
+        p = p * x + np.float32(5.0000001201e-1)
+        row[s] = (p * x) * x + x + np.float32(1.0)
+        bits[s] = (np.int32(n) + np.int32(127)) << np.int32(23)
+    for s in range(row.size):
+        total[s] += row[s] * power[s]
+
+
+@njit(cache=True, nogil=True)
+def stand(places, cylinders, owner, owners, odds, start, stop):
+    """Give what is free at the places (n, 3) start..stop (two coordinates along the support
+    surface, height over it) in a world to the cylinders (m, 5) there: world, middle, radius, top."""
+    for i in range(start, stop):
+        u, v, height = places[i]
+        for c in range(len(cylinders)):
+            du, dv = u - cylinders[c, 1], v - cylinders[c, 2]
+            if du * du + dv * dv <= cylinders[c, 3] ** 2 and height <= cylinders[c, 4]:
+                s = int(cylinders[c, 0])
+                if owners[i, s] == 0:
+                    owners[i, s], odds[i, s] = owner, MOST_ODDS
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -26,7 +26,6 @@ _FINEST = 16.0  # stored steps per voxel, at most
 _MAX_VOXELS = 40_000_000
 _LEAST = 1.0 / 512.0  # P(occupied) below which no threshold makes a draw occupy a place
 _STREAM = 0x10617  # other random numbers than the weights'
-_GEMM_ROWS = 1024  # points per matrix product: their logits stay in the cache
 
 
 @dataclass(frozen=True)
@@ -557,49 +556,53 @@ class Owners:
         return np.flatnonzero(near).astype(np.int64)
 
     def sample(self) -> np.ndarray:
-        """Return the drawn weights (features, S x K), made when first asked for: seconds for a
-        large map. Features first, so that a product over the hinges near a block reads whole
-        rows."""
+        """Return the drawn weights (features, K, S), made when first asked for: seconds for a
+        large map."""
         if self._weights is None:
             weights = self._map.sample_weights(self._n_worlds, self._seed)
             own = thresholds(weights.shape[0], weights.shape[2] - 1, self._seed)
-            self._thresholds = np.pad(own, ((0, 0), (1, 0))).ravel()
-            self._weights = np.moveaxis(weights, 0, 1).reshape(weights.shape[1], -1)
+            self._thresholds = np.pad(own, ((0, 0), (1, 0))).T.astype(np.float32)
+            self._weights = np.ascontiguousarray(weights.transpose(1, 2, 0), np.float32)
         return self._weights
 
     def draw(self, blocks: Int[np.ndarray, " b"]) -> None:
         """Fill the rows of all voxels of some blocks."""
+        blocks = blocks[~self._drawn[blocks]]
+        pieces = [slice(*self._block_start[b : b + 2]) for b in blocks]
+        members = np.concatenate([self._by_block[:0], *(self._by_block[p] for p in pieces)])
+        if len(members) == 0:
+            return
+        index = self.voxels[members] + self.first
+        found = np.zeros((len(members), self._n_worlds), np.uint8)
+        odds = np.empty(found.shape, np.int8)
+        known = members < self.judged
+        odds[~known] = -self._free[members[~known] - self.judged, None]
+        found[known], odds[known] = self._classify(self._resolution * index[known])
         first_row = len(self._map.object_ids)
-        for block in blocks[~self._drawn[blocks]]:
-            piece = slice(int(self._block_start[block]), int(self._block_start[block + 1]))
-            members = self._by_block[piece]
-            index = self.voxels[members] + self.first
-            points = self._resolution * index
-            found = np.zeros((len(members), self._n_worlds), np.uint8)
-            odds = np.empty(found.shape, np.int8)
-            end = int(np.searchsorted(members, self.judged))  # members are in order
-            for start in range(0, end, _GEMM_ROWS):
-                rows = slice(start, min(start + _GEMM_ROWS, end))
-                self._classify(points[rows], found[rows], odds[rows])
-            odds[end:] = -self._free[members[end:] - self.judged, None]
-            if self._unseen is not None:
-                self._unseen.stand(index, self._cylinders, first_row + 1, found, odds)
-            self.table[first_row + members] = found
-            self.odds[first_row + members] = odds
-            self._drawn[block] = True
+        if self._unseen is not None:
+            self._unseen.stand(index, self._cylinders, first_row + 1, found, odds)
+        self.table[first_row + members] = found
+        self.odds[first_row + members] = odds
+        self._drawn[blocks] = True
 
     def _classify(
-        self, points: Points, out: UInt8[np.ndarray, "n s"], odds: Int8[np.ndarray, "n s"]
-    ) -> None:
-        """Fill in the class that occupies each point (m) in each draw, 0 is none, and the log-odds.
-        O(points x hinges near any x S x K): points should be near each other."""
+        self, points: Points
+    ) -> tuple[UInt8[np.ndarray, "n s"], Int8[np.ndarray, "n s"]]:
+        """Return the class that occupies each point (m) in each draw, 0 is none, and the log-odds.
+        O(points x hinges near each x S x K)."""
         space, weights = self._map.space, self.sample()
-        low, high = points.min(axis=0) - space.radius, points.max(axis=0) + space.radius
-        near = np.flatnonzero(((space.hinges > low) & (space.hinges < high)).all(axis=1))
-        away = ((points[:, None] - space.hinges[near]) ** 2).sum(axis=2)
-        phi = np.where(away <= space.radius**2, np.exp(-space.gamma * away), 0.0)
-        logits = phi @ weights[near] + weights[-1]
+        owners = np.empty((len(points), self._n_worlds), np.uint8)
+        odds = np.empty(owners.shape, np.int8)
+        prior = np.zeros((len(points), weights.shape[1]))
         if self._map.prior is not None:
-            logits += np.tile(self._map.prior.at(points), self._n_worlds)
-        logits[self._map.informed(points)] += self._thresholds
-        kernels.classify(logits, self._n_worlds, weights.shape[1] // self._n_worlds, out, odds)
+            prior = self._map.prior.at(points)
+        own, used = self._map.informed(points), weights.any(axis=2)
+
+        def draw(piece: slice) -> None:
+            kernels.draw_voxels(
+                points, *space.kernel_arguments, space.gamma, prior, own, weights, used,
+                self._thresholds, owners, odds, piece.start, piece.stop,
+            )  # fmt: skip
+
+        run_chunked(draw, len(points), 256)
+        return owners, odds

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int8, UInt8
 from scipy.ndimage import maximum_filter
 
-from vprism_plan._kernels.risk import MOST_ODDS
+from vprism_plan._kernels import risk as kernels
+from vprism_plan._threads import run_chunked
 from vprism_plan.mapping.prior import FADE
 from vprism_plan.perception import Plane
 from vprism_plan.world import visibility
@@ -148,17 +149,14 @@ class UnseenObjects:
         """Give voxels that are free in a world to its cylinders, if their centres are in them and
         the voxels in the mask."""
         rows = np.flatnonzero(_marked(self.mask, index - self.first))
-        if len(rows) == 0:
-            return
         points = self.resolution * index[rows]
-        flat, height = points @ self.plane.axes().T, self.plane.signed_distance(points)
-        middle = cylinders[:, 1:3]
-        away = np.linalg.norm(middle - middle.clip(flat.min(axis=0), flat.max(axis=0)), axis=1)
-        for world, u, v, radius, top in cylinders[away <= cylinders[:, 3]]:
-            inside = ((flat - (u, v)) ** 2).sum(axis=1) <= radius**2
-            own = rows[inside & (height <= top)]
-            own = own[owners[own, int(world)] == 0]
-            owners[own, int(world)], odds[own, int(world)] = owner, MOST_ODDS
+        places = np.column_stack([points @ self.plane.axes().T, self.plane.signed_distance(points)])
+        own, their_odds = owners[rows], odds[rows]
+        run_chunked(
+            lambda s: kernels.stand(places, cylinders, owner, own, their_odds, s.start, s.stop),
+            len(rows), 1024,
+        )  # fmt: skip
+        owners[rows], odds[rows] = own, their_odds
 
 
 def _marked(mask: Bool[np.ndarray, "x y z"], local: Int[np.ndarray, "n 3"]) -> Chosen:
