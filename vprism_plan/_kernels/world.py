@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compiled kernels of the world: distance transforms, visibility, field queries.
+"""Compiled kernels of the world: distance transforms, guesses, visibility, field queries.
 
 Every kernel releases the GIL and works on a slice of preallocated outputs, so a
 thread pool can run it in pieces. A kernel calls only kernels of this file.
@@ -217,6 +217,108 @@ def mark_cells_within(balls, origin, spacing, marked):
                 for z in range(lo[2], hi[2]):
                     if dy + (z - middle[2]) ** 2 <= reach * reach:
                         marked[x, y, z] = True
+
+
+# --- Guesses: grids in places of their own -------------------------------------------
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _along(pose, axis, point):
+    """One coordinate of a point (3,) after pose (3, 4)."""
+    x, y, z = point[0], point[1], point[2]
+    return pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]
+
+
+@njit(cache=True, nogil=True)
+def _trilinear(grid, x, y, z):
+    """Value of a grid at an index; its border goes on for ever."""
+    nx, ny, nz = grid.shape
+    x, y, z = min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0), min(max(z, 0.0), nz - 1.0)
+    i, j, k = int(x), int(y), int(z)
+    u, v, w = x - i, y - j, z - k
+    a, b, c = min(i + 1, nx - 1), min(j + 1, ny - 1), min(k + 1, nz - 1)
+    low = (1.0 - v) * ((1.0 - w) * grid[i, j, k] + w * grid[i, j, c])
+    low += v * ((1.0 - w) * grid[i, b, k] + w * grid[i, b, c])
+    high = (1.0 - v) * ((1.0 - w) * grid[a, j, k] + w * grid[a, j, c])
+    high += v * ((1.0 - w) * grid[a, b, k] + w * grid[a, b, c])
+    return (1.0 - u) * low + u * high
+
+
+@njit(cache=True, nogil=True)
+def guesses(points, poses, grids, node_pose, elsewhere, fade, empty, out, start, stop):
+    """`PriorField.logits` of the points start..stop: out (n, K); `empty` where nothing is."""
+    C, last = len(grids), grids.shape[1] - 1.0
+    at = np.empty((C, 3))
+    share = np.empty(C)
+    for i in range(start, stop):
+        covered = 0.0
+        for c in range(C):
+            inside = np.inf
+            for axis in range(3):
+                at[c, axis] = _along(poses[c], axis, points[i])
+                inside = min(inside, at[c, axis], last - at[c, axis])
+            share[c] = min(max(inside / fade, 0.0), 1.0)
+            covered = max(covered, share[c])
+        x = _along(node_pose, 0, points[i])
+        y = _along(node_pose, 1, points[i])
+        z = _along(node_pose, 2, points[i])
+        other = _trilinear(elsewhere, x, y, z)
+        other += covered * (empty - other)
+        out[i, 0] = 0.0
+        for c in range(C):
+            out[i, 1 + c] = other
+            if share[c] > 0.0:
+                own = _trilinear(grids[c], at[c, 0], at[c, 1], at[c, 2])
+                out[i, 1 + c] += share[c] * (own - other)
+
+
+@njit(cache=True, nogil=True)
+def _extremes(grid, pose, center, half, ends):
+    """Least and greatest of the nodes around a cube, ends (2,), and how far it reaches into the
+    grid from its side, in steps: all of it, and any of it."""
+    first = np.empty(3, np.int64)
+    final = np.empty(3, np.int64)
+    whole, some = np.inf, np.inf
+    for axis in range(3):
+        last = grid.shape[axis] - 1.0
+        at = _along(pose, axis, center)
+        reach = half * (abs(pose[axis, 0]) + abs(pose[axis, 1]) + abs(pose[axis, 2]))
+        whole = min(whole, at - reach, last - at - reach)
+        some = min(some, at + reach, last - at + reach)
+        first[axis] = int(min(max(math.floor(at - reach), 0.0), last))
+        final[axis] = int(min(max(math.ceil(at + reach), 0.0), last))
+    ends[0], ends[1] = np.inf, -np.inf
+    for i in range(first[0], final[0] + 1):
+        for j in range(first[1], final[1] + 1):
+            for k in range(first[2], final[2] + 1):
+                ends[0] = min(ends[0], grid[i, j, k])
+                ends[1] = max(ends[1], grid[i, j, k])
+    return whole, some
+
+
+@njit(cache=True, nogil=True)
+def guess_bounds(
+    centers, half, poses, grids, node_pose, elsewhere, fade, empty, low, high, start, stop
+):  # fmt: skip
+    """Bounds of the objects' logits of `guesses` in cubes: low and high (n, C)."""
+    C = len(grids)
+    ends = np.empty(2)
+    whole, some = np.empty(C), np.empty(C)
+    for i in range(start, stop):
+        deepest, nearest = -np.inf, -np.inf
+        for c in range(C):
+            whole[c], some[c] = _extremes(grids[c], poses[c], centers[i], half, ends)
+            low[i, c], high[i, c] = ends
+            deepest, nearest = max(deepest, whole[c]), max(nearest, some[c])
+        _extremes(elsewhere, node_pose, centers[i], half, ends)
+        other_low = empty if nearest > 0.0 else ends[0]
+        other_high = empty if deepest >= fade else ends[1]
+        for c in range(C):
+            if some[c] <= 0.0:
+                low[i, c], high[i, c] = other_low, other_high
+            elif whole[c] < fade:
+                low[i, c] = min(low[i, c], other_low)
+                high[i, c] = max(high[i, c], other_high)
 
 
 # --- Visibility ---------------------------------------------------------------------

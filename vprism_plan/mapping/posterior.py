@@ -180,10 +180,12 @@ class VPrismMap:
         Where kernels reach (their mass is at least `min_support`), or the package's prior has
         looked: around every object.
         """
-        known = np.asarray(self.support(points)) >= min_support
+        points = np.asarray(points)
         # A hypothesis of the user's own says nothing of what else hides around an object.
         own = self.prior is not None and self.prior.own
-        return known if own else known | self.informed(points)
+        known = np.zeros(len(points), bool) if own else self.informed(points)
+        known[~known] = np.asarray(self.support(points[~known])) >= min_support
+        return known
 
     def informed(self, points: Any) -> Bool[np.ndarray, " n"]:
         """Return where P(occupied) of points (N, 3) m says what is there, and not what a flat prior

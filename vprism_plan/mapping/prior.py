@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from vprism_plan._arguments import number
+from vprism_plan._kernels import world as kernels
+from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.perception.camera import invert_transform, project, transform_points
 from vprism_plan.perception.observation import Observation
@@ -268,8 +270,17 @@ class PriorField:
 
     def at(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n k"]:
         """Return the same for numpy points, float64."""
-        with torch.no_grad():
-            return self.logits(torch.from_numpy(np.ascontiguousarray(points))).numpy()
+        out = np.empty((len(points), 1 + len(self.log_odds)))
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        run_chunked(
+            lambda s: kernels.guesses(points, *self._grids, out, s.start, s.stop), len(out), 4096
+        )
+        return out
+
+    @property
+    def _grids(self) -> tuple[Any, ...]:
+        """What the kernels take after points."""
+        return self.T_voxel_world, self.log_odds, self.T_node_world, self.elsewhere, FADE, -MOST
 
     def bounds(
         self, centers: Float[np.ndarray, "n 3"], half: float
@@ -279,40 +290,15 @@ class PriorField:
         What a trilinear grid says in a cube lies between the least and the greatest of the
         nodes around it.
         """
-        last = self.log_odds.shape[1] - 1
-        grids = [
-            _extremes(grid, pose, centers, half)
-            for pose, grid in zip(self.T_voxel_world, self.log_odds, strict=True)
-        ]
-        insides = [(np.minimum(at, last - at), reach) for *_, at, reach in grids]
-        touched = np.stack([(i > -reach).all(axis=1) for i, reach in insides], axis=1)
-        held = np.stack([(i >= FADE + reach).all(axis=1) for i, reach in insides], axis=1)
-        flat_low, flat_high, *_ = _extremes(self.elsewhere, self.T_node_world, centers, half)
-        other_low = np.where(touched.any(axis=1), -MOST, flat_low)[:, None]
-        other_high = np.where(held.any(axis=1), -MOST, flat_high)[:, None]
-        low, high = (np.stack([grid[k] for grid in grids], axis=1) for k in (0, 1))
-        mixed_low = np.where(touched, np.minimum(low, other_low), other_low)
-        mixed_high = np.where(touched, np.maximum(high, other_high), other_high)
-        return np.where(held, low, mixed_low), np.where(held, high, mixed_high)
-
-
-def _extremes(
-    grid: Float[np.ndarray, "x y z"],
-    pose: Float[np.ndarray, "3 4"],
-    centers: Float[np.ndarray, "n 3"],
-    half: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return bounds of a grid in cubes of the world, (n,) each; where their centres lie in it,
-    (n, 3), and how far they reach from there, (3,), both in its steps."""
-    at = centers @ pose[:, :3].T + pose[:, 3]
-    reach = half * np.abs(pose[:, :3]).sum(axis=1)
-    size = tuple(2 * np.ceil(reach + 0.5).astype(int) + 1)
-    nearest = np.clip(np.rint(at).astype(np.int64), 0, np.array(grid.shape) - 1)
-    low, high = (
-        extreme(grid, size, mode="nearest")[tuple(nearest.T)].astype(np.float64)
-        for extreme in (minimum_filter, maximum_filter)
-    )
-    return low, high, at, reach
+        low, high = np.empty((2, len(centers), len(self.log_odds)))
+        centers = np.ascontiguousarray(centers)
+        run_chunked(
+            lambda s: kernels.guess_bounds(
+                centers, half, *self._grids, low, high, s.start, s.stop
+            ),
+            len(centers), 512,
+        )  # fmt: skip
+        return low, high
 
 
 def _transformed(pose: Float[np.ndarray, "3 4"], points: Float[Tensor, "n 3"]) -> Tensor:

@@ -180,11 +180,13 @@ def points_around(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     cells, inverse, counts = np.unique(
         np.floor(points / _CELL).astype(np.int64), axis=0, return_inverse=True, return_counts=True
     )
-    index = {
-        tuple(cell): count for cell, count in zip(cells.tolist(), counts.tolist(), strict=True)
-    }
+    cells -= cells.min(axis=0, initial=0) - 1  # the neighbours of all have keys, in order
+    shape = cells.max(axis=0, initial=0) + 2
+    keys = np.ravel_multi_index(tuple(cells.T), tuple(shape))
+    totals = np.concatenate([[0], np.cumsum(counts)])
     around = np.zeros(len(cells), dtype=np.int64)
-    for shift in product((-1, 0, 1), repeat=3):
-        near = (cells + np.array(shift)).tolist()
-        around += np.array([index.get(tuple(cell), 0) for cell in near], dtype=np.int64)
+    for x, y in product((-1, 0, 1), repeat=2):  # three in a row follow one another
+        low = keys + (x * shape[1] + y) * shape[2] - 1
+        ends = [np.searchsorted(keys, key) for key in (low, low + 3)]
+        around += totals[ends[1]] - totals[ends[0]]
     return around[inverse.reshape(-1)]

@@ -177,17 +177,36 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         if size == 2:
             safety = _CURVATURE_SAFETY if prior is None else _KINKS
             return LevelSet(spacing, (*inner, _border(index, g, owners, step, safety)), evaluations)
-        least = most = g
-        if prior is not None:
-            guess = prior.at(nodes * spacing)[where, 1:]
-            low, high = prior.bounds(spacing * (index + size), spacing * size)
-            most = g + (high[:, None] - guess).max(axis=2).reshape(g.shape)
-            least = g - (guess - low[:, None]).max(axis=2).reshape(g.shape)
-        inside, border = _divide(index, size, g, owners, (least, most), step)
+        guess = None if prior is None else prior.at(nodes * spacing)[where, 1:]
+        bounds = _Bounds(prior, spacing, g, guess)
+        inside, border = _divide(index, size, g, owners, bounds, step)
         inner.append(inside)
         index = border.index
         if len(index) == 0:
             return LevelSet(spacing, tuple(inner), evaluations)
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """Log-odds (n, 3, 3, 3) at the nodes of cells, as if a guess (n, 27, C) were, all over a cell,
+    what it is at the least, and at the most."""
+
+    prior: Any
+    spacing: float
+    g: Float[np.ndarray, "n 3 3 3"]
+    guess: Float[np.ndarray, "n 27 c"] | None
+
+    def over(
+        self, rows: Any, block: Any, middle: Float[np.ndarray, "m 3"], half: float
+    ) -> tuple[Float[np.ndarray, "m *nodes"], Float[np.ndarray, "m *nodes"]]:
+        """Return both at some nodes of some cells, for cubes of edge 2 `half` lattice steps."""
+        g = self.g[rows][block]
+        if self.guess is None:
+            return g, g
+        guess = self.guess[rows].reshape(-1, 3, 3, 3, self.guess.shape[2])[block]
+        low, high = self.prior.bounds(self.spacing * middle, self.spacing * half)
+        low, high = low[:, None, None, None], high[:, None, None, None]
+        return g - (guess - low).max(axis=4), g + (high - guess).max(axis=4)
 
 
 def _divide(
@@ -195,24 +214,28 @@ def _divide(
     size: int,
     g: Float[np.ndarray, "n 3 3 3"],
     owners: UInt8[np.ndarray, "n 3 3 3"],
-    bounds: tuple[Float[np.ndarray, "n 3 3 3"], Float[np.ndarray, "n 3 3 3"]],
+    bounds: _Bounds,
     step: float,
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
-    least, most = bounds
-    below, above = (_slack(part, step) for part in bounds)
+    least, most = bounds.over(slice(None), (slice(None),), index + size, size)
+    below, above = (_slack(part, step) for part in (least, most))
     inside, border = [], []
     for child in _CHILDREN:
         block = (slice(None), *(slice(c, c + 2) for c in child))
-        label, around = _ownership(
-            g[block].reshape(-1, 8), most[block].reshape(-1, 8), owners[block].reshape(-1, 8), above
-        )
-        cells = Cells(index + child * size, size, label, around)
-        whole = least[block].min(axis=(1, 2, 3)) >= below
+        rows = np.flatnonzero(most[block].max(axis=(1, 2, 3)) >= -above)
+        corner = index[rows] + child * size
+        low, high = bounds.over(rows, block, corner + 0.5 * size, 0.5 * size)
+        chosen = high.max(axis=(1, 2, 3)) >= -above[rows]
+        rows = rows[chosen]
+        values, owner = (part[rows][block].reshape(-1, 8) for part in (g, owners))
+        label, around = _ownership(values, high[chosen].reshape(-1, 8), owner, above[rows])
+        cells = Cells(corner[chosen], size, label, around)
+        whole = low[chosen].min(axis=(1, 2, 3)) >= below[rows]
         whole &= (around == around[:, :1]).all(axis=1)
         inside.append(cells.select(whole))
-        border.append(cells.select((most[block].max(axis=(1, 2, 3)) >= -above) & ~whole))
+        border.append(cells.select(~whole))
     return _join(inside), _join(border)
 
 

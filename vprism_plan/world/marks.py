@@ -31,6 +31,7 @@ from vprism_plan.world.sources import LAST_MARK, MARKED
 from vprism_plan.world.unseen_objects import OpenSides, UnseenObjects, open_sides
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
+_CHUNK = 1 << 17  # cells whose logits are in memory at once
 
 
 class Evidence:
@@ -179,11 +180,7 @@ def _trust_posterior(
     if sides is not None:  # the foot of clutter is no business of unseen objects, either
         low = replace(config, background_height=visibility.THIN)
         flat = _behind_clutter(map_, low, corner, spacing, hidden.shape)
-    for x in range(len(hidden)):
-        index = np.argwhere(hidden[x])
-        if len(index) == 0:
-            continue
-        index = np.column_stack([np.full(len(index), x), index])
+    for index in np.array_split(np.argwhere(hidden), 1 + hidden.sum() // _CHUNK):
         points = corner + spacing * (index + 0.5)
         known = map_.judges(points, config.min_support)
         if sides is not None:

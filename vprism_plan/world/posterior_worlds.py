@@ -585,9 +585,7 @@ class Owners:
         self.odds[first_row + members] = odds
         self._drawn[blocks] = True
 
-    def _classify(
-        self, points: Points
-    ) -> tuple[UInt8[np.ndarray, "n s"], Int8[np.ndarray, "n s"]]:
+    def _classify(self, points: Points) -> tuple[UInt8[np.ndarray, "n s"], Int8[np.ndarray, "n s"]]:
         """Return the class that occupies each point (m) in each draw, 0 is none, and the log-odds.
         O(points x hinges near each x S x K)."""
         space, weights = self._map.space, self.sample()

@@ -42,8 +42,8 @@ class OpenSides:
         for own, pose in zip(self._open, self._prior.T_voxel_world, strict=True):
             points = np.linalg.solve(pose[:, :3], (nodes - pose[:, 3]).T).T
             hidden = visibility.classify_points(views, points) != visibility.SEEN
-            held = np.asarray(map_.occupancy(points)) >= _GOES_ON
-            own[tuple(nodes[hidden & held].T)] = True
+            held = np.asarray(map_.occupancy(points[hidden])) >= _GOES_ON
+            own[tuple(nodes[hidden][held].T)] = True
             own[:] = maximum_filter(own, 3)  # points between nodes are asked about
 
     def reach(self, points: Points) -> Chosen:
@@ -98,8 +98,10 @@ class UnseenObjects:
         if density <= 0.0 or not cells.any():
             return None
         # Voxel k reaches half a step either way of node k: over the cells 2 k - 1 and 2 k.
-        x, y, z = grid.shape
-        mask = np.pad(cells, 1).reshape(x, 2, y, 2, z, 2).any(axis=(1, 3, 5))
+        mask = np.pad(cells, 1)
+        mask = mask[0::2] | mask[1::2]
+        mask = mask[:, 0::2] | mask[:, 1::2]
+        mask = mask[:, :, 0::2] | mask[:, :, 1::2]
         index = np.argwhere(mask) + grid.first
         index = index[plane.signed_distance(grid.spacing * index) <= HEIGHTS[1]]
         if len(index) == 0:
