@@ -138,8 +138,10 @@ def _add_exp(row, best, bits, power, total):
 
 @njit(cache=True, nogil=True)
 def stand(places, cylinders, owner, owners, odds, start, stop):
-    """Give what is free at the places (n, 3) start..stop (two coordinates along the support
-    surface, height over it) in a world to the cylinders (m, 5) there: world, middle, radius, top."""
+    """Give what is free at the places (n, 3) start..stop in a world to the cylinders (m, 5) there.
+
+    Places: two coordinates along the support surface, height; cylinders: world, middle, radius,
+    top."""
     for i in range(start, stop):
         u, v, height = places[i]
         for c in range(len(cylinders)):
@@ -202,7 +204,8 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
     """Distance from every wanted voxel of a block to the nearest occupied one, per draw, and
     depth in occupied ones.
 
-    Exact Euclidean, one pass per axis over a halo of `reach` voxels.
+    Exact Euclidean, one pass per axis over a halo of `reach` voxels, without what is farther than
+    that along the axes before.
 
     owner_row, owners, odds: which draw occupies what; voxels outside the array are free.
     counts (256,): whether an object class counts as occupied.
@@ -210,7 +213,10 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
     lut: squared distance to what is stored. wanted (B, B, B): row of `out`, or -1.
     """
     n_draws = owners.shape[1]
-    wide = BLOCK + 2 * reach
+    wide, limit = BLOCK + 2 * reach, (reach + 1) ** 2
+    gap = np.zeros(wide, np.int64)  # squared distance of a layer from the block
+    for i in range(reach):
+        gap[i] = gap[wide - 1 - i] = (reach - i) ** 2
     along_z = np.empty((wide, wide, BLOCK, n_draws), np.uint16)
     some = np.zeros((wide, wide), np.bool_)
     solid = np.empty(n_draws, np.uint16)
@@ -220,9 +226,10 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
             continue
         for j in range(wide):
             y = cy - reach + j
-            if y < 0 or y >= owner_row.shape[1]:
+            if y < 0 or y >= owner_row.shape[1] or gap[i] + gap[j] >= limit:
                 continue
-            for z in range(max(cz - reach, 0), min(cz + BLOCK + reach, owner_row.shape[2])):
+            ball = int(np.sqrt(limit - 1 - gap[i] - gap[j]))
+            for z in range(max(cz - ball, 0), min(cz + BLOCK + ball, owner_row.shape[2])):
                 row = owner_row[x, y, z]
                 if row < 0:
                     continue
@@ -231,8 +238,8 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
                     along_z[i, j] = _FAR
                 for s in range(n_draws):
                     solid[s] = np.uint16(0) if counts[owners[row, s]] else _FAR
-                low = max(z - cz - reach, 0)
-                high = min(z - cz + reach + 1, BLOCK)
+                low = max(z - cz - ball, 0)
+                high = min(z - cz + ball + 1, BLOCK)
                 for k in range(low, high):
                     away = np.uint16((z - cz - k) ** 2)
                     best = along_z[i, j, k]
@@ -246,7 +253,8 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
                 if not any_y[i]:
                     any_y[i] = True
                     along_y[i] = _FAR
-                for b in range(max(j - 2 * reach, 0), min(j + 1, BLOCK)):
+                ball = int(np.sqrt(limit - 1 - gap[i]))
+                for b in range(max(j - reach - ball, 0), min(j - reach + ball + 1, BLOCK)):
                     away = np.uint16((j - reach - b) ** 2)
                     for k in range(BLOCK):
                         best = along_y[i, b, k]
@@ -255,9 +263,9 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
                             best[s] = min(best[s], np.uint16(column[s] + away))
     total = np.empty(n_draws, np.uint16)
     steepest, squares = np.empty(n_draws, np.float32), np.empty(n_draws, np.float32)
-    for a in range(BLOCK):
-        for b in range(BLOCK):
-            for k in range(BLOCK):
+    for b in range(BLOCK):
+        for k in range(BLOCK):
+            for a in range(BLOCK):  # innermost: what it reads of `along_y` stays in the cache
                 row = wanted[a, b, k]
                 if row < 0:
                     continue

@@ -428,13 +428,12 @@ def _tails(
     owner, odds = np.empty(n, np.uint8), np.empty(n, np.uint8)
     n_objects = len(map_.object_ids)
     slab = int(shape[1] * shape[2])
-    step = max(1, 200_000 // slab)
-    for start in range(0, int(shape[0]), step):
-        stop = min(start + step, int(shape[0]))
-        index = np.moveaxis(np.indices((stop - start, int(shape[1]), int(shape[2]))), 0, -1)
-        points = resolution * (index.reshape(-1, 3) + first + [start, 0, 0])
+
+    def look(layers: slice) -> None:
+        index = np.moveaxis(np.indices((layers.stop - layers.start, *shape[1:].tolist())), 0, -1)
+        points = resolution * (index.reshape(-1, 3) + first + [layers.start, 0, 0])
         mean, variance = map_.logit_moments(points)
-        piece, rows = slice(start * slab, stop * slab), np.arange(len(points))
+        piece, rows = slice(layers.start * slab, layers.stop * slab), np.arange(len(points))
         gap = mean[:, 1:] - mean[:, :1]
         spread = np.sqrt(variance[:, 1:] + variance[:, :1])
         most = np.where(map_.informed(points), -logit(_LEAST), 0.0) + np.log(n_objects)
@@ -448,6 +447,8 @@ def _tails(
         surely = most - np.log(n_objects) + logsumexp(gap, axis=1) + 2.0 * spread[rows, best]
         steps = np.floor(-kernels.ODDS * surely)
         odds[piece] = steps.clip(1, kernels.MOST_ODDS)
+
+    run_chunked(look, int(shape[0]), max(1, 40_000 // slab))
     return occupied, lost, owner, odds
 
 

@@ -260,9 +260,14 @@ def classify_points(views: Sequence[View], points: Points) -> UInt8[np.ndarray, 
     points = np.ascontiguousarray(points, dtype=np.float64)
     status = np.full(len(points), kernels.UNOBSERVED, dtype=np.uint8)
     for view in views:
-        kernels.classify_points(
-            points, view.camera, view.optics, view.reach, view.holes, status, 0, len(points)
-        )
+
+        def look(piece: slice, view: View = view) -> None:
+            kernels.classify_points(
+                points, view.camera, view.optics, view.reach, view.holes, status,
+                piece.start, piece.stop,
+            )  # fmt: skip
+
+        run_chunked(look, len(points), 1 << 14)
     balls = robot_balls(views)
     hidden = np.flatnonzero(status != kernels.FREE) if len(balls) else np.empty(0, dtype=int)
     robot = hidden[within_balls(points[hidden], balls)]

@@ -111,9 +111,9 @@ class World:
         known = self._timed("known geometry", self._known_distances, solids)
         known += self._solid_distances(self._support, SUPPORT, self.grid)
         self._known: NodeDistances = combine(known, self.grid)
-        others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
+        self._others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
         self.field: DistanceField = self._timed(
-            "combine", self._field, [self._objects, *others, self._known]
+            "combine", self._field, [self._objects, *self._others, self._known]
         )
         self._said: tuple[str, ...] = ()
         self._lowered: World | None = None
@@ -276,8 +276,11 @@ class World:
         gone = frozenset(classes_of(self.map, without))
         key = ("certain, all that was seen" if seen else "certain", gone)
         if key not in self._cache:
-            marks = self._without(self._all_seen if seen else self._unseen, gone)
-            self._cache[key] = self._field([*self._unseen_distances(marks), self._known], gone)
+            others = self._others
+            if seen or gone:
+                marks = self._without(self._all_seen if seen else self._unseen, gone)
+                others = self._unseen_distances(marks)
+            self._cache[key] = self._field([*others, self._known], gone)
         return self._cache[key]
 
     @cached_property
