@@ -321,6 +321,20 @@ def guess_bounds(
                 high[i, c] = max(high[i, c], other_high)
 
 
+@njit(cache=True, nogil=True)
+def widen(guess, where, low, high, least, most, start, stop):
+    """Change log-odds least and most (n, c) by the most that any logit may differ from guess
+    (m, K) at where (n, c), if it is anywhere within low and high (n, C)."""
+    for i in range(start, stop):
+        for c in range(where.shape[1]):
+            down, up = -np.inf, -np.inf
+            for k in range(low.shape[1]):
+                own = guess[where[i, c], 1 + k]
+                down, up = max(down, own - low[i, k]), max(up, high[i, k] - own)
+            least[i, c] -= down
+            most[i, c] += up
+
+
 # --- Visibility ---------------------------------------------------------------------
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from vprism_plan._kernels import world as kernels
+from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
 from vprism_plan.world.distance import Lattice, lattice_nodes
 from vprism_plan.world.grid import Chosen, Index, Points, Values
@@ -177,8 +178,8 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         if size == 2:
             safety = _CURVATURE_SAFETY if prior is None else _KINKS
             return LevelSet(spacing, (*inner, _border(index, g, owners, step, safety)), evaluations)
-        guess = None if prior is None else prior.at(nodes * spacing)[where, 1:]
-        bounds = _Bounds(prior, spacing, g, guess)
+        guess = None if prior is None else prior.at(nodes * spacing)
+        bounds = _Bounds(prior, spacing, g.reshape(-1, 27), where, guess)
         inside, border = _divide(index, size, g, owners, bounds, step)
         inner.append(inside)
         index = border.index
@@ -188,25 +189,29 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
 
 @dataclass(frozen=True)
 class _Bounds:
-    """Log-odds (n, 3, 3, 3) at the nodes of cells, as if a guess (n, 27, C) were, all over a cell,
-    what it is at the least, and at the most."""
+    """Log-odds (n, 27) of cells at their nodes, and `where` these are among those with a guess."""
 
     prior: Any
     spacing: float
-    g: Float[np.ndarray, "n 3 3 3"]
-    guess: Float[np.ndarray, "n 27 c"] | None
+    g: Float[np.ndarray, "n 27"]
+    where: Int[np.ndarray, "n 27"]
+    guess: Float[np.ndarray, "m k"] | None
 
     def over(
-        self, rows: Any, block: Any, middle: Float[np.ndarray, "m 3"], half: float
-    ) -> tuple[Float[np.ndarray, "m *nodes"], Float[np.ndarray, "m *nodes"]]:
-        """Return both at some nodes of some cells, for cubes of edge 2 `half` lattice steps."""
-        g = self.g[rows][block]
+        self, rows: Any, nodes: Any, middle: Float[np.ndarray, "r 3"], half: float
+    ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
+        """Return log-odds at some nodes of some cells, as if the guess were what it is at the
+        least, and at the most, in cubes of edge 2 `half` lattice steps."""
+        g, where = self.g[rows][:, nodes], self.where[rows][:, nodes]
         if self.guess is None:
             return g, g
-        guess = self.guess[rows].reshape(-1, 3, 3, 3, self.guess.shape[2])[block]
         low, high = self.prior.bounds(self.spacing * middle, self.spacing * half)
-        low, high = low[:, None, None, None], high[:, None, None, None]
-        return g - (guess - low).max(axis=4), g + (high - guess).max(axis=4)
+        least, most = g.copy(), g.copy()
+        run_chunked(
+            lambda s: kernels.widen(self.guess, where, low, high, least, most, s.start, s.stop),
+            len(g), 4096,
+        )  # fmt: skip
+        return least, most
 
 
 def _divide(
@@ -219,20 +224,20 @@ def _divide(
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
-    least, most = bounds.over(slice(None), (slice(None),), index + size, size)
-    below, above = (_slack(part, step) for part in (least, most))
+    least, most = bounds.over(slice(None), slice(None), index + size, size)
+    below, above = (_slack(part.reshape(g.shape), step) for part in (least, most))
     inside, border = [], []
     for child in _CHILDREN:
-        block = (slice(None), *(slice(c, c + 2) for c in child))
-        rows = np.flatnonzero(most[block].max(axis=(1, 2, 3)) >= -above)
+        nodes = (child + _CHILDREN) @ [9, 3, 1]
+        rows = np.flatnonzero(most[:, nodes].max(axis=1) >= -above)
         corner = index[rows] + child * size
-        low, high = bounds.over(rows, block, corner + 0.5 * size, 0.5 * size)
-        chosen = high.max(axis=(1, 2, 3)) >= -above[rows]
+        low, high = bounds.over(rows, nodes, corner + 0.5 * size, 0.5 * size)
+        chosen = high.max(axis=1) >= -above[rows]
         rows = rows[chosen]
-        values, owner = (part[rows][block].reshape(-1, 8) for part in (g, owners))
-        label, around = _ownership(values, high[chosen].reshape(-1, 8), owner, above[rows])
+        values, owner = (part.reshape(-1, 27)[rows][:, nodes] for part in (g, owners))
+        label, around = _ownership(values, high[chosen], owner, above[rows])
         cells = Cells(corner[chosen], size, label, around)
-        whole = low[chosen].min(axis=(1, 2, 3)) >= below[rows]
+        whole = low[chosen].min(axis=1) >= below[rows]
         whole &= (around == around[:, :1]).all(axis=1)
         inside.append(cells.select(whole))
         border.append(cells.select(~whole))
