@@ -8,6 +8,10 @@ Kernels release the GIL and are run over chunks by a small thread pool. That kee
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+_Result = TypeVar("_Result")
 
 
 def worker_count() -> int:
@@ -49,3 +53,14 @@ def run_chunked(work: Callable[[slice], None], n: int, size: int) -> None:
     with ThreadPoolExecutor(workers) as pool:
         for future in [pool.submit(work, piece) for piece in pieces]:
             future.result()
+
+
+@contextmanager
+def beside(work: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
+    """Call `work` while the block runs, if there are threads for both; what the block gets returns
+    the result, or raises what `work` did."""
+    if worker_count() == 1:
+        yield work
+    else:
+        with ThreadPoolExecutor(1) as pool:
+            yield pool.submit(work).result

@@ -109,9 +109,30 @@ def edt_pass_y(d, labels, first, step, out_d, out_l, start, stop):
                 out_l[x, t, z] = labels[x, q, z]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _rounded_down(value):
+    """The nearest float32 that is not above a value."""
+    single = np.float32(value)
+    if single > value:
+        single = np.nextafter(single, np.float32(-np.inf))
+    return single
+
+
 @njit(cache=True, nogil=True)
-def edt_pass_x(d, labels, first, step, out_d, out_l, start, stop):
-    """Add the x axis to the squared distances of `edt_pass_y`; slices run over y."""
+def edt_layers(labels, first_y, first_z, step, out_d, out_l, start, stop):
+    """Squared distance within each of the layers start..stop, along z and y."""
+    d = np.empty((1, labels.shape[1], out_d.shape[2]), np.int32)
+    near = np.empty(d.shape, np.uint8)
+    for x in range(start, stop):
+        own = slice(x, x + 1)
+        edt_pass_z(labels[own], first_z, step, d, near, 0, 1)
+        edt_pass_y(d, near, first_y, step, out_d[own], out_l[own], 0, 1)
+
+
+@njit(cache=True, nogil=True)
+def edt_pass_x(d, labels, first, step, unit, out_d, out_l, start, stop):
+    """Add the x axis to the squared distances of `edt_layers`, and write the distances, rounded
+    down, for lattice steps of length `unit`; slices run over y."""
     nx, nz = d.shape[0], d.shape[2]
     nt = out_d.shape[0]
     column = np.empty(nx, np.int64)
@@ -125,14 +146,14 @@ def edt_pass_x(d, labels, first, step, out_d, out_l, start, stop):
             k = 0
             for t in range(nt):
                 if n == 0:
-                    out_d[t, y, z] = FAR
+                    out_d[t, y, z] = np.inf
                     out_l[t, y, z] = 0
                     continue
                 pos = first + step * t
                 while k + 1 < n and bound[k + 1] < pos:
                     k += 1
                 q = where[k]
-                out_d[t, y, z] = column[q] + (pos - q) * (pos - q)
+                out_d[t, y, z] = _rounded_down(unit * math.sqrt(column[q] + (pos - q) * (pos - q)))
                 out_l[t, y, z] = labels[q, y, z]
 
 
@@ -140,10 +161,7 @@ def edt_pass_x(d, labels, first, step, out_d, out_l, start, stop):
 def round_down(values, out):
     """out (n,) float32: the nearest that is not above each value (n,)."""
     for i in range(values.size):
-        single = np.float32(values[i])
-        if single > values[i]:
-            single = np.nextafter(single, np.float32(-np.inf))
-        out[i] = single
+        out[i] = _rounded_down(values[i])
 
 
 @njit(cache=True, nogil=True)

@@ -50,25 +50,20 @@ def distance_to_lattice(
     Infinite, with label 0, if nothing is marked."""
     first = [int(v) for v in grid.first * lattice.factor - lattice.corner]
     nx, ny, nz = grid.shape
-    X, Y, _ = lattice.labels.shape
+    X = len(lattice.labels)
     step = lattice.factor
     labels = np.ascontiguousarray(lattice.labels)
-    d_z, l_z = np.empty((X, Y, nz), np.int32), np.empty((X, Y, nz), np.uint8)
-    run_chunked(
-        lambda s: kernels.edt_pass_z(labels, first[2], step, d_z, l_z, s.start, s.stop), X, 16
-    )
     d_y, l_y = np.empty((X, ny, nz), np.int32), np.empty((X, ny, nz), np.uint8)
     run_chunked(
-        lambda s: kernels.edt_pass_y(d_z, l_z, first[1], step, d_y, l_y, s.start, s.stop), X, 16
+        lambda s: kernels.edt_layers(labels, *first[1:], step, d_y, l_y, s.start, s.stop), X, 16
     )
-    squares, nearest = np.empty((nx, ny, nz), np.int32), np.empty((nx, ny, nz), np.uint8)
+    distance, nearest = np.empty((nx, ny, nz), np.float32), np.empty((nx, ny, nz), np.uint8)
     run_chunked(
-        lambda s: kernels.edt_pass_x(d_y, l_y, first[0], step, squares, nearest, s.start, s.stop),
-        ny,
-        8,
-    )
-    distance = round_down(grid.spacing / step * np.sqrt(squares.astype(np.float64)))
-    distance[squares >= kernels.FAR] = np.inf
+        lambda s: kernels.edt_pass_x(
+            d_y, l_y, first[0], step, grid.spacing / step, distance, nearest, s.start, s.stop
+        ),
+        ny, 8,
+    )  # fmt: skip
     return distance, nearest
 
 

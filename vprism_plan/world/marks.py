@@ -54,8 +54,11 @@ class Evidence:
         self.below = visibility.make_views(map_.views, tolerance) if self.bounded else None
         found = {i for view in map_.views for i in lost_objects(view)}
         self.without_depth = tuple(sorted(found - set(map_.object_ids)))
-        self._sides = open_sides(map_, config, self.views)
         self.unseen: UnseenObjects | None = None
+
+    @cached_property
+    def _sides(self) -> OpenSides | None:
+        return open_sides(self._map, self._config, self.views)
 
     @cached_property
     def _clutter(self) -> tuple[Points, Values]:
@@ -73,13 +76,9 @@ class Evidence:
     def _cones(self) -> list[list[Cone]]:
         return [lost_cones(view, self._map.plane) for view in self._map.views]
 
-    def marks(
-        self, occluded: OccludedPolicy, grid: Grid, objects: Nodes | None, inner: Grid | None = None
-    ) -> Lattice:
+    def hidden(self, occluded: OccludedPolicy, grid: Grid, inner: Grid | None = None) -> Lattice:
         """Mark, `CELLS` times finer than the grid, occluded (by that policy) and unobserved cells
-        outside the box of `inner`, and seen surfaces that no object of the map holds, by the
-        distance of the grid's nodes to the level set (metres); all that was seen of the objects, if
-        that is not given."""
+        outside the box of `inner`."""
         spacing = grid.spacing / CELLS
         cells = tuple(CELLS * (n - 1) for n in grid.shape)
         shape = (cells[0], cells[1], cells[2])
@@ -94,7 +93,7 @@ class Evidence:
                 left = _trust_posterior(
                     self._map, self._config, status, grid.origin, spacing, self._sides
                 )
-                if self._sides is not None and self.unseen is None:
+                if self._sides is not None:
                     self.unseen = UnseenObjects.among(
                         left, grid, self._map.plane, self._config.hidden_objects
                     )
@@ -114,19 +113,15 @@ class Evidence:
                 len(nodes),
                 16,
             )
-        self._mark_seen(nodes, grid, objects, inner)
         return Lattice(nodes, grid.first * CELLS, CELLS)
 
-    def with_all_seen(self, marks: Lattice, grid: Grid) -> Lattice:
-        """Return marks of the grid with all that was seen of the objects, as `marks` without their
-        distance gives them."""
+    def with_seen(
+        self, marks: Lattice, grid: Grid, objects: Nodes | None = None, inner: Grid | None = None
+    ) -> Lattice:
+        """Return marks of the grid with the seen surfaces outside the box of `inner` that no object
+        of the map holds, by the distance of the grid's nodes to the level set (metres); all that
+        was seen of the objects, if that is not given."""
         nodes = marks.labels.copy()
-        self._mark_seen(nodes, grid, None, None)
-        return Lattice(nodes, marks.corner, CELLS)
-
-    def _mark_seen(
-        self, nodes: np.ndarray, grid: Grid, objects: Nodes | None, inner: Grid | None
-    ) -> None:
         spacing = grid.spacing / CELLS
         for label, points, half in self._seen(grid, objects, 0.5 * spacing):
             kept: Any = slice(None)
@@ -135,6 +130,7 @@ class Evidence:
             kernels.mark_boxes(
                 points[kept], half[kept], grid.origin, spacing, np.uint8(label), nodes
             )
+        return Lattice(nodes, marks.corner, CELLS)
 
     def _seen(self, grid: Grid, objects: Nodes | None, step: float) -> Iterator[Surface]:
         """Marks, points and half the widths of what was seen, the less important first: an

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from vprism_plan._threads import beside
 from vprism_plan.errors import WorldError
 from vprism_plan.world import visibility
 from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, WorldConfig
@@ -27,7 +28,12 @@ from vprism_plan.world.distance import (
     round_down,
 )
 from vprism_plan.world.grid import Grid, Points, Vector, choose_grid, grid_beyond
-from vprism_plan.world.levelset import lattice_refinement, rasterize_level_set, trace_level_set
+from vprism_plan.world.levelset import (
+    LevelSet,
+    lattice_refinement,
+    rasterize_level_set,
+    trace_level_set,
+)
 from vprism_plan.world.marks import CELLS, Evidence, only, rasterize_mesh, unmark
 from vprism_plan.world.posterior_worlds import PosteriorWorlds, classes_of
 from vprism_plan.world.seen import RIM, seen_support
@@ -65,13 +71,15 @@ class World:
             the support surface first, if the map has one. Read-only.
         plane_names: their names.
         sources: names that `field.source` indexes.
-        timings: seconds per step of the bake.
+        timings: seconds per step of the bake; some steps run at the same time.
 
     Raises:
         WorldError: the map says "occupied" without evidence, or the grid is too large.
     """
 
-    def __init__(self, map: Any, config: WorldConfig | None = None) -> None:
+    def __init__(
+        self, map: Any, config: WorldConfig | None = None, _traced: LevelSet | None = None
+    ) -> None:
         self.map = map
         self.config = WorldConfig() if config is None else config
         self.timings: dict[str, float] = {}
@@ -90,24 +98,30 @@ class World:
             *(f"known:{k.name}" for k in solids),
         )
         self.plane_names, self.planes = self._half_spaces()
-        choose_grid(map, self.config, None)  # tracing for a grid too large even so takes minutes
+        # Before the level set, whose tracing for a grid too large even so takes minutes.
+        self.grid: Grid = choose_grid(map, self.config, None)
+        self._support = seen_support(map.views, map.plane) if self._bounded else None
         self._factor = lattice_refinement(self.config.resolution, map)
         fine = self.config.resolution / self._factor
-        self._level_set = self._timed("level set", trace_level_set, map, fine, self.config.level)
+        with beside(self._all_hidden) as hidden:
+            self._level_set = _traced or self._timed(
+                "level set", trace_level_set, map, fine, self.config.level
+            )
+            found = hidden()
         box = self._level_set.box()
-        self.grid: Grid = choose_grid(
+        grid = choose_grid(
             map, self.config, None if box is None else (box[0] * fine, box[1] * fine)
         )
-        self._support = seen_support(map.views, map.plane) if self._bounded else None
+        if (grid.first != self.grid.first).any() or grid.shape != self.grid.shape:
+            self.grid = grid
+            found = self._all_hidden()
+        marks, self._marks_beyond, self._beyond, self._from_beyond = found
         self._objects: NodeDistances = self._timed(
             "distance to objects", self._object_distances, None
         )
         self._unseen: Lattice = self._timed(
-            "visibility", self._evidence.marks, self.config.occluded, self.grid,
-            self._objects.distance,
-        )  # fmt: skip
-        self._marks_beyond = self._timed("beyond", self._mark_beyond)
-        self._beyond, self._from_beyond = self._around(self._marks_beyond, True)
+            "seen", self._evidence.with_seen, marks, self.grid, self._objects.distance
+        )
         known = self._timed("known geometry", self._known_distances, solids)
         known += self._solid_distances(self._support, SUPPORT, self.grid)
         self._known: NodeDistances = combine(known, self.grid)
@@ -167,12 +181,22 @@ class World:
         index[marks] = [*range(classes), *range(first, first + lost)]
         return index
 
+    def _all_hidden(
+        self,
+    ) -> tuple[Lattice, Lattice | None, DistanceField | None, list[NodeDistances]]:
+        """What does not depend on the level set: marks of hidden space, and all beyond the grid."""
+        occluded = self.config.occluded
+        marks = self._timed("visibility", self._evidence.hidden, occluded, self.grid)
+        beyond = self._timed("beyond", self._mark_beyond)
+        return marks, beyond, *self._around(beyond, True)
+
     def _mark_beyond(self) -> Lattice | None:
         """Mark what was seen outside the grid, unless all of that is an obstacle anyway."""
         if self.config.unobserved == "occupied" or not self.map.views:
             return None
         occluded: OccludedPolicy = "free" if self.config.occluded == "free" else "occupied"
-        return self._evidence.marks(occluded, self._grid_beyond, None, inner=self.grid)
+        marks = self._evidence.hidden(occluded, self._grid_beyond, self.grid)
+        return self._evidence.with_seen(marks, self._grid_beyond, None, self.grid)
 
     @property
     def _grid_beyond(self) -> Grid:
@@ -285,7 +309,7 @@ class World:
 
     @cached_property
     def _all_seen(self) -> Lattice:
-        return self._evidence.with_all_seen(self._unseen, self.grid)
+        return self._evidence.with_seen(self._unseen, self.grid)
 
     def source_field(self, name: str, without: Collection[int] = ()) -> DistanceField:
         """Distance to one of `sources` alone; baked on first use and kept.
@@ -415,7 +439,7 @@ class World:
         if lower <= RIM:
             return self
         if self._lowered is None:
-            self._lowered = World(self.map, replace(self.config, support="seen"))
+            self._lowered = World(self.map, replace(self.config, support="seen"), self._level_set)
             self._lowered._said = (
                 f"the robot's base stands {lower:.2f} m below the support plane, so the support "
                 f"surface counts only where it was seen and {RIM:g} m around; "
