@@ -179,8 +179,12 @@ def _pose(owner: str, value: Any) -> np.ndarray:
 
 def _from_slabs(excess: np.ndarray) -> np.ndarray:
     """Signed distance to a product of slabs, from the signed distance to each, (n, k)."""
-    outside = np.linalg.norm(np.maximum(excess, 0.0), axis=1)
-    return outside + np.minimum(excess.max(axis=1), 0.0)
+    # Column by column: numpy's reductions along a short axis take four times as long.
+    squares, deepest = np.zeros(len(excess)), np.full(len(excess), -np.inf)
+    for column in excess.T:
+        squares += np.maximum(column, 0.0) ** 2
+        np.maximum(deepest, column, out=deepest)
+    return np.sqrt(squares) + np.minimum(deepest, 0.0)
 
 
 @dataclass(frozen=True)

@@ -221,10 +221,12 @@ def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
 def at_nodes(grid: Grid, bound: Callable[[np.ndarray], np.ndarray]) -> Nodes:
     """Bounds of a distance at all nodes, at least 0 and rounded down."""
     distance = np.empty(grid.shape, dtype=np.float32)
-    for start in range(0, grid.shape[0], 16):
-        stop = min(start + 16, grid.shape[0])
-        outside = np.maximum(bound(grid.slab(start, stop)), 0.0)
-        distance[start:stop] = round_down(outside).reshape(-1, *grid.shape[1:])
+
+    def look(layers: slice) -> None:
+        outside = np.maximum(bound(grid.slab(layers.start, layers.stop)), 0.0)
+        distance[layers] = round_down(outside).reshape(-1, *grid.shape[1:])
+
+    run_chunked(look, grid.shape[0], 8)
     return distance
 
 
