@@ -36,7 +36,6 @@ from vprism_plan.world.visibility import OCCLUDED, OUTSIDE, SEEN, UNSEEN
 _HELD_OUT = 1_000_003  # added to the seed of the draws
 _ONE = np.zeros(1, np.int64)
 _MAX_SAMPLES = 64
-_SLAB = 8  # planes of nodes classified at once
 # Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
 PADDINGS = (0.5, 1.0, 2.0)
 # Voxels by which a draw's surface may lie off where its voxels put it.
@@ -438,26 +437,23 @@ class PathRisk:
 
 class SpaceCodes:
     """What is known of the space around each node of a world's grid, by the codes of
-    `visibility`: SEEN also where it is hidden and the map has support. Baked once, O(nodes), one
-    byte per node."""
+    `visibility`: SEEN also where it is hidden and the map has support. Judged when first asked for,
+    one byte per node."""
 
     def __init__(self, world: Any) -> None:
-        field = world.field
-        self._origin = np.asarray(field.origin, dtype=np.float64)
-        self._spacing = float(field.spacing)
-        shape = field.distance.shape
-        self._codes = np.empty(shape, np.uint8)
-        for start in range(0, shape[0], _SLAB):
-            stop = min(start + _SLAB, shape[0])
-            index = np.moveaxis(np.indices((stop - start, *shape[1:])), 0, -1).reshape(-1, 3)
-            corner = self._origin + self._spacing * np.array([start, 0, 0])
-            points = corner + self._spacing * index
-            codes = np.asarray(world.status(points)).astype(np.uint8)
-            codes[codes == OUTSIDE] = SEEN  # rounding at the faces
-            hidden = np.flatnonzero(codes == OCCLUDED)
-            judged = world.map.judges(points[hidden], world.config.min_support)
-            codes[hidden[judged]] = SEEN
-            self._codes[start:stop] = codes.reshape(stop - start, *shape[1:])
+        self._world = world
+        self._codes = np.full(world.field.distance.shape, risk.NOT_JUDGED, np.uint8)
+
+    def _judge(self, nodes: Int[np.ndarray, " n"]) -> None:
+        world = self._world
+        index = np.stack(np.unravel_index(nodes, self._codes.shape), axis=1)
+        points = world.field.origin + world.field.spacing * index
+        codes = np.asarray(world.status(points)).astype(np.uint8)
+        codes[codes == OUTSIDE] = SEEN  # rounding at the faces
+        hidden = np.flatnonzero(codes == OCCLUDED)
+        judged = world.map.judges(points[hidden], world.config.min_support)
+        codes[hidden[judged]] = SEEN
+        self._codes.reshape(-1)[nodes] = codes
 
     def shares(
         self,
@@ -468,13 +464,19 @@ class SpaceCodes:
         """Return the share of the swept volume that lies in each kind of space not judged: seven
         points per ball (its centre and six at three fifths of the radius), balls weighted by
         volume, over at most 64 samples spread along the path; none of balls with rule -1."""
-        n = len(centers)
+        n, field = len(centers), self._world.field
         chosen = _ONE if n == 1 else np.arange(m := min(n, _MAX_SAMPLES)) * (n - 1) // (m - 1)
-        totals = np.zeros(4)
-        risk.volume_codes(
-            centers, chosen, radii, rules, self._codes, self._origin, self._spacing, totals
-        )
-        whole = max(sum(totals.tolist()), 1e-300)
+        missing = np.empty(7 * len(chosen) * len(radii), np.int64)
+        while True:
+            totals = np.zeros(4)
+            count = risk.volume_codes(
+                centers, chosen, radii, rules, self._codes, field.origin, float(field.spacing),
+                totals, missing,
+            )  # fmt: skip
+            if not count:
+                break
+            self._judge(np.unique(missing[:count]))
+        whole = max(float(totals.sum()), 1e-300)
         return {name: float(totals[code]) / whole for code, name in UNSEEN.items()}
 
 
