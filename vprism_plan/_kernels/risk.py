@@ -218,8 +218,9 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
     gap = np.zeros(wide, np.int64)  # squared distance of a layer from the block
     for i in range(reach):
         gap[i] = gap[wide - 1 - i] = (reach - i) ** 2
-    along_z = np.empty((wide, wide, BLOCK, n_draws), np.uint16)
-    some = np.zeros((wide, wide), np.bool_)
+    along_z = np.empty((BLOCK, n_draws), np.uint16)  # of one column: stays in the cache
+    along_y = np.empty((wide, BLOCK, BLOCK, n_draws), np.uint16)
+    any_y = np.zeros(wide, np.bool_)
     solid = np.empty(n_draws, np.uint16)
     for i in range(wide):
         x = cx - reach + i
@@ -229,39 +230,35 @@ def bake_block(owner_row, owners, odds, counts, cx, cy, cz, reach, lut, wanted, 
             y = cy - reach + j
             if y < 0 or y >= owner_row.shape[1] or gap[i] + gap[j] >= limit:
                 continue
+            some = False
             ball = int(np.sqrt(limit - 1 - gap[i] - gap[j]))
             for z in range(max(cz - ball, 0), min(cz + BLOCK + ball, owner_row.shape[2])):
                 row = owner_row[x, y, z]
                 if row < 0:
                     continue
-                if not some[i, j]:
-                    some[i, j] = True
-                    along_z[i, j] = _FAR
+                if not some:
+                    some = True
+                    along_z[:] = _FAR
                 for s in range(n_draws):
                     solid[s] = np.uint16(0) if counts[owners[row, s]] else _FAR
-                low = max(z - cz - ball, 0)
-                high = min(z - cz + ball + 1, BLOCK)
-                for k in range(low, high):
+                for k in range(max(z - cz - ball, 0), min(z - cz + ball + 1, BLOCK)):
                     away = np.uint16((z - cz - k) ** 2)
-                    best = along_z[i, j, k]
+                    best = along_z[k]
                     for s in range(n_draws):
                         best[s] = min(best[s], np.uint16(solid[s] + away))
-    along_y = np.empty((wide, BLOCK, BLOCK, n_draws), np.uint16)
-    any_y = np.zeros(wide, np.bool_)
-    for i in range(wide):
-        for j in range(wide):
-            if some[i, j]:
-                if not any_y[i]:
-                    any_y[i] = True
-                    along_y[i] = _FAR
-                ball = int(np.sqrt(limit - 1 - gap[i]))
-                for b in range(max(j - reach - ball, 0), min(j - reach + ball + 1, BLOCK)):
-                    away = np.uint16((j - reach - b) ** 2)
-                    for k in range(BLOCK):
-                        best = along_y[i, b, k]
-                        column = along_z[i, j, k]
-                        for s in range(n_draws):
-                            best[s] = min(best[s], np.uint16(column[s] + away))
+            if not some:
+                continue
+            if not any_y[i]:
+                any_y[i] = True
+                along_y[i] = _FAR
+            ball = int(np.sqrt(limit - 1 - gap[i]))
+            for b in range(max(j - reach - ball, 0), min(j - reach + ball + 1, BLOCK)):
+                away = np.uint16((j - reach - b) ** 2)
+                for k in range(BLOCK):
+                    best = along_y[i, b, k]
+                    column = along_z[k]
+                    for s in range(n_draws):
+                        best[s] = min(best[s], np.uint16(column[s] + away))
     total = np.empty(n_draws, np.uint16)
     steepest, squares = np.empty(n_draws, np.float32), np.empty(n_draws, np.float32)
     for b in range(BLOCK):

@@ -130,12 +130,12 @@ class PosteriorWorlds:
         """Everything but the lock; nobody fills the tables of a copy but the copy."""
         with self._lock:
             state = {**self.__dict__, "_owners": self._owners.snapshot()}
-        del state["_lock"]
+        del state["_lock"], state["_room"]
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
-        self._lock = threading.RLock()
+        self._lock, self._room = threading.RLock(), self.tables.rows
 
     def __repr__(self) -> str:
         return (
@@ -156,6 +156,8 @@ class PosteriorWorlds:
         return other
 
     def _nothing_baked(self) -> Tables:
+        # More rows than there are: who asks again and again must not copy all that is baked.
+        self._room = np.empty((0, self.n_worlds), np.uint8)
         rows = np.repeat(self._grown[None], len(self._rules), axis=0)
         return Tables(rows, np.empty((0, self.n_worlds), np.uint8), np.empty(0, np.uint8))
 
@@ -322,7 +324,11 @@ class PosteriorWorlds:
             corners = np.array(todo) * BLOCK - self._whole  # in voxels of the owners
             reached = corners - self._whole, corners + BLOCK - 1 + self._whole
             self._owners.draw(self._owners.blocks_within(*reached))
-            fresh = np.empty((count, self.n_worlds), np.uint8)
+            have = len(old.rows)
+            if have + count > len(self._room):
+                self._room = np.empty((max(have + count, 3 * have // 2), self.n_worlds), np.uint8)
+                self._room[:have] = old.rows
+            fresh = self._room[have : have + count]
             counts = self.counting()[rule]
 
             def work(piece: slice) -> None:
@@ -337,9 +343,9 @@ class PosteriorWorlds:
             for block, rows in zip(todo, wanted, strict=True):
                 target = updated[rule][_block_slices(block)]
                 part = rows[tuple(slice(n) for n in target.shape)]
-                target[part >= 0] = part[part >= 0] + len(old.rows)
-            grown, lowest = [old.rows, fresh], [old.lowest, fresh.min(axis=1)]
-            self.tables = Tables(updated, np.concatenate(grown), np.concatenate(lowest))
+                target[part >= 0] = part[part >= 0] + have
+            lowest = np.concatenate([old.lowest, fresh.min(axis=1)])
+            self.tables = Tables(updated, self._room[: have + count], lowest)
 
 
 def _block_slices(block: Index) -> Slices:
