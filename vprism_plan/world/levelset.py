@@ -224,7 +224,7 @@ def _divide(
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
-    least, most = bounds.over(slice(None), slice(None), index + size, size)
+    least, most = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size)
     below, above = (_slack(part.reshape(g.shape), step) for part in (least, most))
     inside, border = [], []
     for child in _CHILDREN:
