@@ -4,7 +4,8 @@
     python -m experiments.benchmarks.bake [--map FILE] [--repeat 3]
 
 Times are wall clock of the fastest repetition, after one bake that compiles or loads
-the kernels. Read them as shares of one run: machines and their load differ.
+the kernels. Read them as shares of one run: machines and their load differ. Steps that run at the
+same time add up to more than the whole.
 """
 
 import argparse
