@@ -570,6 +570,7 @@ class Owners:
             own = thresholds(weights.shape[0], weights.shape[2] - 1, self._seed)
             self._thresholds = np.pad(own, ((0, 0), (1, 0))).T.astype(np.float32)
             self._weights = np.ascontiguousarray(weights.transpose(1, 2, 0), np.float32)
+            self._used = self._weights.any(axis=2)
         return self._weights
 
     def draw(self, blocks: Int[np.ndarray, " b"]) -> None:
@@ -601,11 +602,11 @@ class Owners:
         prior = np.zeros((len(points), weights.shape[1]))
         if self._map.prior is not None:
             prior = self._map.prior.at(points)
-        own, used = self._map.informed(points), weights.any(axis=2)
+        own = self._map.informed(points)
 
         def draw(piece: slice) -> None:
             kernels.draw_voxels(
-                points, *space.kernel_arguments, space.gamma, prior, own, weights, used,
+                points, *space.kernel_arguments, space.gamma, prior, own, weights, self._used,
                 self._thresholds, owners, odds, piece.start, piece.stop,
             )  # fmt: skip
 
