@@ -1,6 +1,7 @@
 """Slow twins of `PosteriorWorlds`: every draw evaluated at every voxel asked about."""
 
 import numpy as np
+from scipy.stats import norm
 
 
 def draw_logits(map_, points, n_worlds, seed, thresholds=True):
@@ -18,12 +19,24 @@ def draw_logits(map_, points, n_worlds, seed, thresholds=True):
     if not thresholds:
         return logits
     known = np.asarray(map_.informed(points))
-    # Of S draws one per object and part of [0, 1]: u < sigmoid(z) occupies.
-    rng = np.random.default_rng([seed, 0x10617])
-    for k in range(1, logits.shape[2]):
-        u = np.clip((rng.permutation(n_worlds) + 0.5) / n_worlds, 1 / 512, 1 - 1 / 512)
-        logits[known, :, k] += np.log(u) - np.log(1.0 - u)
+    for row in np.flatnonzero(known):
+        logits[row, :, 1:] += threshold(points[row], n_worlds, seed)[:, None]
     return logits
+
+
+def threshold(point, n_worlds, seed):
+    """(S,): logistic, from normal numbers at the corners of the cell of 10 cm around a point."""
+    low = np.floor(point / 0.1).astype(int)
+    share = point / 0.1 - low
+    total, square = np.zeros(n_worlds), 0.0
+    for corner in np.ndindex(2, 2, 2):
+        rng = np.random.default_rng([seed, 0x10617, *(low + corner + 2**31).tolist()])
+        u = (rng.permutation(n_worlds) + 0.5) / n_worlds
+        weight = np.prod(np.where(corner, share, 1.0 - share))
+        total += weight * norm.ppf(u)
+        square += weight**2
+    p = norm.cdf(total / np.sqrt(square)).clip(1 / 512, 1 - 1 / 512)
+    return np.log(p / (1.0 - p))
 
 
 def owners_of(logits):

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int8, Int32, UInt8
+from jaxtyping import Bool, Float32, Int, Int8, Int32, UInt8
 from scipy import ndimage
-from scipy.special import logit, logsumexp, ndtr
+from scipy.special import logit, logsumexp, ndtr, ndtri
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._kernels import risk as kernels
@@ -25,6 +25,9 @@ MAX_REACH = 31  # voxels; squared distances of three axes then fit the 16 bits o
 _FINEST = 16.0  # stored steps per voxel, at most
 _MAX_VOXELS = 40_000_000
 _LEAST = 1.0 / 512.0  # P(occupied) below which no threshold makes a draw occupy a place
+_MOST = float(logit(1.0 - _LEAST))
+APART = 0.1  # m between the nodes of thresholds: what one end of an object is says little of another
+_NODES = 2**32  # of the lattice of thresholds along an axis
 _STREAM = 0x10617  # other random numbers than the weights'
 
 
@@ -40,12 +43,13 @@ class Tables:
 class PosteriorWorlds:
     """S joint draws of a map's weights: S worlds that the camera's view does not tell apart.
 
-    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s + t_s)_0 > 1/2 at its centre x, the
-    level of the mesh, and belongs to the object of the largest logit. The thresholds t_s, one per
-    object, are logistic: a map that says P(occupied) = 0.2, and is sure of that, is occupied in a
-    fifth of the draws. Where no prior has looked (`VPrismMap.informed`), and the map only says that
-    nobody knows, they are 0. The same draw holds everywhere, so what hides in one place is
-    correlated with what hides next to it.
+    In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1 / (1 + exp(t_s(x))) at its
+    centre x (for t_s = 0 the level of the mesh), and belongs to the object of the largest logit.
+    The thresholds t_s are logistic: a map that says P(occupied) = 0.2, and is sure of that, is
+    occupied in a fifth of the draws. They are independent at the nodes of a lattice 10 cm apart
+    and vary slowly between them: what hides in one place is correlated with what hides next to
+    it, and says little of what hides behind the other end of an object. Where no prior has looked
+    (`VPrismMap.informed`), and the map only says that nobody knows, they are 0.
 
     The surface of a draw lies between voxels, where its log-odds, linear between centres, are 0.
     An occupied voxel stands for the ball around its centre that reaches to the surface (at most a
@@ -396,7 +400,7 @@ def judge(map_: Any, resolution: float, tolerance: float) -> Verdicts:
     With Gaussian logits z of mean m and variance v, C objects, and thresholds within +-t, a draw
     occupies a voxel only if some z_k - z_0 > -t - ln C: by the union bound its probability is at
     most sum_k Phi(-(m_0 - m_k - t - ln C) / sqrt(v_0 + v_k)). It does not give the voxel to class k
-    only if z_k - z_0 < t or z_k - z_j < 2 t for another object j: a sum of the same form. The
+    only if z_k - z_0 < t or z_k < z_j for another object j: a sum of the same form. The
     voxels with the smallest bounds are skipped, as many as sum up to half the tolerance each way:
     that bounds the error of the probability of any event, a path's collision included.
     """
@@ -442,11 +446,11 @@ def _tails(
         piece, rows = slice(layers.start * slab, layers.stop * slab), np.arange(len(points))
         gap = mean[:, 1:] - mean[:, :1]
         spread = np.sqrt(variance[:, 1:] + variance[:, :1])
-        most = np.where(map_.informed(points), -logit(_LEAST), 0.0) + np.log(n_objects)
+        most = np.where(map_.informed(points), _MOST, 0.0) + np.log(n_objects)
         occupied[piece] = ndtr((gap + most[:, None]) / spread).sum(axis=1)
         best = gap.argmax(axis=1)
         apart = np.sqrt(variance[rows, 1 + best, None] + variance[:, 1:])
-        others = ndtr((gap - gap[rows, best, None] + 2.0 * most[:, None]) / apart)
+        others = ndtr((gap - gap[rows, best, None]) / apart)
         others[rows, best] = 0.0
         lost[piece] = ndtr((most - gap[rows, best]) / spread[rows, best]) + others.sum(axis=1)
         owner[piece] = best + 1
@@ -467,13 +471,18 @@ def _skippable(bound: Values, budget: float) -> Chosen:
     return skip
 
 
-def thresholds(n_worlds: int, n_objects: int, seed: int) -> Float[np.ndarray, "s c"]:
-    """Log-odds (S, C) that each draw adds to each object's: logistic, so that the share of draws
-    above 0 is the probability; one from each of S equally probable parts, in an order of its own
-    per object, and none beyond `_LEAST` on either side."""
-    rng = np.random.default_rng([seed, _STREAM])
-    at = np.stack([rng.permutation(n_worlds) for _ in range(n_objects)], axis=1)
-    return np.asarray(logit(((at + 0.5) / n_worlds).clip(_LEAST, 1.0 - _LEAST)))
+def doubts(
+    lower: Index, shape: Shape3, n_worlds: int, seed: int
+) -> Float32[np.ndarray, "nx ny nz s"]:
+    """Standard normal numbers of S draws at the nodes `lower` + (0, ..., shape - 1) of the lattice
+    of thresholds, independent between nodes: at each the middles of S equally probable parts, in
+    an order that only the seed and the node decide."""
+    middles = ndtri((np.arange(n_worlds) + 0.5) / n_worlds).astype(np.float32)
+    out = np.empty((*shape, n_worlds), np.float32)
+    for node in np.ndindex(shape):
+        name = (lower + node + _NODES // 2).tolist()
+        out[node] = middles[np.random.default_rng([seed, _STREAM, *name]).permutation(n_worlds)]
+    return out
 
 
 class Owners:
@@ -567,8 +576,10 @@ class Owners:
         large map."""
         if self._weights is None:
             weights = self._map.sample_weights(self._n_worlds, self._seed)
-            own = thresholds(weights.shape[0], weights.shape[2] - 1, self._seed)
-            self._thresholds = np.pad(own, ((0, 0), (1, 0))).T.astype(np.float32)
+            low = np.floor(self._resolution / APART * self.first).astype(np.int64)
+            high = np.floor(self._resolution / APART * (self.first + self.row.shape))
+            x, y, z = (high.astype(np.int64) - low + 2).tolist()
+            self._doubts = APART * low, doubts(low, (x, y, z), self._n_worlds, self._seed)
             self._weights = np.ascontiguousarray(weights.transpose(1, 2, 0), np.float32)
             self._used = self._weights.any(axis=2)
         return self._weights
@@ -607,7 +618,7 @@ class Owners:
         def draw(piece: slice) -> None:
             kernels.draw_voxels(
                 points, *space.kernel_arguments, space.gamma, prior, own, weights, self._used,
-                self._thresholds, owners, odds, piece.start, piece.stop,
+                *self._doubts, APART, _MOST, owners, odds, piece.start, piece.stop,
             )  # fmt: skip
 
         run_chunked(draw, len(points), 256)
