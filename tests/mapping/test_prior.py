@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import MapConfig, MeshPrior, fit_map, load_map
-from vprism_plan.mapping.prior import FLAT_OCCUPANCY, MOST, SIDE, Crop, PriorField, hidden_depth
+from vprism_plan.mapping.prior import FLAT_OCCUPANCY, MOST, SEEN, SIDE, Crop, PriorField, hidden_depth
 from vprism_plan.perception.plane import Plane
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scenes import Scene, render, upright
@@ -48,7 +48,7 @@ def textbook(field, points):
             min(max(min(*at, *(SIDE - 1.0 - at)) / 2.0, 0.0), 1.0) for at in places
         ]  # of an object's own grid, from its side inwards
         for k, (at, share) in enumerate(zip(places, shares, strict=True)):
-            other = (1.0 - max(shares)) * flat + max(shares) * -MOST
+            other = (1.0 - max(shares)) * flat + max(shares) * -SEEN
             own = trilinear(field.log_odds[k], at)
             expected[row, 1 + k] = share * own + (1.0 - share) * other
     return expected

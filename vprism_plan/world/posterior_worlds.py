@@ -26,7 +26,7 @@ _FINEST = 16.0  # stored steps per voxel, at most
 _MAX_VOXELS = 40_000_000
 _LEAST = 1.0 / 512.0  # P(occupied) below which no threshold makes a draw occupy a place
 _MOST = float(logit(1.0 - _LEAST))
-APART = 0.1  # m between the nodes of thresholds: what one end of an object is says little of another
+APART = 0.05  # m between the nodes of thresholds: what one end of an object is says little of another
 _NODES = 2**32  # of the lattice of thresholds along an axis
 _STREAM = 0x10617  # other random numbers than the weights'
 
@@ -46,7 +46,7 @@ class PosteriorWorlds:
     In draw s a voxel is occupied where 1 - softmax(phi(x) W_s)_0 > 1 / (1 + exp(t_s(x))) at its
     centre x (for t_s = 0 the level of the mesh), and belongs to the object of the largest logit.
     The thresholds t_s are logistic: a map that says P(occupied) = 0.2, and is sure of that, is
-    occupied in a fifth of the draws. They are independent at the nodes of a lattice 10 cm apart
+    occupied in a fifth of the draws. They are independent at the nodes of a lattice 5 cm apart
     and vary slowly between them: what hides in one place is correlated with what hides next to
     it, and says little of what hides behind the other end of an object. Where no prior has looked
     (`VPrismMap.informed`), and the map only says that nobody knows, they are 0.
