@@ -14,7 +14,15 @@ from scipy.spatial import cKDTree
 
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import MapConfig, MeshPrior, fit_map, load_map
-from vprism_plan.mapping.prior import FLAT_OCCUPANCY, MOST, SEEN, SIDE, Crop, PriorField, hidden_depth
+from vprism_plan.mapping.prior import (
+    FLAT_OCCUPANCY,
+    MOST,
+    SEEN,
+    SIDE,
+    Crop,
+    PriorField,
+    hidden_depth,
+)
 from vprism_plan.perception.plane import Plane
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scenes import Scene, render, upright

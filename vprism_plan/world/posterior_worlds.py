@@ -26,7 +26,7 @@ _FINEST = 16.0  # stored steps per voxel, at most
 _MAX_VOXELS = 40_000_000
 _LEAST = 1.0 / 512.0  # P(occupied) below which no threshold makes a draw occupy a place
 _MOST = float(logit(1.0 - _LEAST))
-APART = 0.05  # m between the nodes of thresholds: what one end of an object is says little of another
+APART = 0.05  # m between the nodes of thresholds, over which a guess errs alike
 _NODES = 2**32  # of the lattice of thresholds along an axis
 _STREAM = 0x10617  # other random numbers than the weights'
 
