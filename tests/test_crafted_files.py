@@ -19,7 +19,7 @@ from safetensors.numpy import save_file
 
 from vprism_plan.errors import VPrismError
 from vprism_plan.mapping import MapConfig, VPrismMap, load_map
-from vprism_plan.mapping.em import Posterior
+from vprism_plan.mapping.em import Posterior, diagonal_prior
 from vprism_plan.mapping.features import FeatureSpace, sorted_hinges
 from vprism_plan.mapping.serialization import content_digest
 from vprism_plan.perception import Observation, load_observation, save_observation
@@ -114,14 +114,8 @@ def small_map() -> VPrismMap:
     config = MapConfig()
     hinges = sorted_hinges(np.random.default_rng(0).uniform(-0.05, 0.05, (5, 3)))
     space = FeatureSpace(hinges, config.gamma, config.cutoff_radius)
-    precision = np.zeros((space.envelope_size, 2))
-    precision[space.diagonal] = 4.0
-    covariance = np.zeros_like(precision)
-    covariance[space.diagonal] = 0.25
-    posterior = Posterior(
-        np.zeros((space.size, 2)), covariance, precision,
-        np.full(2, space.size * np.log(4.0)), (-2.0, -1.0),
-    )  # fmt: skip
+    classes = diagonal_prior(space, np.zeros((space.size, 2)), np.full(space.size, 0.25))
+    posterior = Posterior(classes, (-2.0, -1.0))
     seen = observation()
     return VPrismMap(config, (1,), seen.plane, (seen,), space, posterior, 0, ("odd",))
 

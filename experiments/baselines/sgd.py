@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from vprism_plan.mapping import MapConfig, VPrismMap
-from vprism_plan.mapping.em import Posterior
+from vprism_plan.mapping.em import Posterior, diagonal_prior
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.fitting import LearningProblem, learning_problem
 from vprism_plan.perception.observation import Observation
@@ -112,9 +112,4 @@ def _certain(
     space: FeatureSpace, weights: Float[np.ndarray, "m k"], history: tuple[float, ...]
 ) -> Posterior:
     """Weights as a posterior of next to no variance."""
-    classes = weights.shape[1]
-    covariance = np.zeros((space.envelope_size, classes))
-    precision = np.zeros_like(covariance)
-    covariance[space.diagonal], precision[space.diagonal] = _VARIANCE, 1.0 / _VARIANCE
-    log_determinant = np.full(classes, -space.size * np.log(_VARIANCE))
-    return Posterior(weights, covariance, precision, log_determinant, history)
+    return Posterior(diagonal_prior(space, weights, np.full(space.size, _VARIANCE)), history)

@@ -59,10 +59,11 @@ def fit(observation: Observation, seed: int, config: MapConfig | None = None) ->
     maps = []
     for k, object_id in enumerate(problem.object_ids, start=1):
         posterior = fit_weights(
-            problem.space, features, (problem.data.classes == k).astype(np.int64), prior,
+            features, (problem.data.classes == k).astype(np.int64), prior,
             iterations=config.iterations,
             variational_updates=config.variational_updates,
             relaxation=config.relaxation,
+            start_variance=config.start_variance,
             tolerance=config.tolerance,
         )  # fmt: skip
         maps.append(

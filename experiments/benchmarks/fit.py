@@ -83,7 +83,7 @@ def main() -> None:
     def ours(iterations: int) -> np.ndarray:
         space = FeatureSpace(hinges, config.gamma, config.cutoff_radius)
         posterior = fit_weights(
-            space, block_features(space, data.points), data.classes,
+            block_features(space, data.points), data.classes,
             weight_prior(space, config, classes),
             iterations=iterations, variational_updates=config.variational_updates,
         )  # fmt: skip

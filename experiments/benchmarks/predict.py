@@ -18,7 +18,7 @@ import torch
 
 from vprism_plan._threads import worker_count
 from vprism_plan.mapping import VPrismMap, fit_map
-from vprism_plan.mapping.factors import dense_class
+from vprism_plan.mapping.factors import dense
 from vprism_plan.simulation.scenes import random_scene
 
 
@@ -26,9 +26,11 @@ class DenseSolves:
     """Prediction with a dense solve per call and class."""
 
     def __init__(self, fitted: VPrismMap) -> None:
-        classes = range(fitted.n_classes)
-        dense = [dense_class(fitted.space, fitted.posterior.precision, k) for k in classes]
-        self.precision = torch.from_numpy(np.stack(dense)).float()
+        every = torch.eye(fitted.space.size).repeat(fitted.n_classes, 1, 1) * 1e30
+        for matrix, own in zip(every, fitted.posterior.classes, strict=True):
+            where = np.ix_(own.members, own.members)
+            matrix[where] = torch.from_numpy(dense(own.space, own.precision)).float()
+        self.precision = every  # weights that a class does not have are surely 0
         self.mean = torch.from_numpy(fitted.posterior.mean).float()
         self.hinges = fitted.hinge_points.float()
         self.gamma = fitted.space.gamma

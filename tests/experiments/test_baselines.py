@@ -286,13 +286,17 @@ def fit_binary(problem, config, k):
     from vprism_plan.mapping.em import weight_prior
 
     prior = weight_prior(problem.space, config, 2)
-    variance = 1.0 / prior.precision[problem.space.diagonal, 0]
+    variance = prior[0].covariance[problem.space.diagonal]
     phi = dense_em.features(
         problem.data.points, problem.space.hinges, config.gamma, problem.space.radius
     )
     classes = (problem.data.classes == k).astype(int)
     return dense_em.fit(
-        phi, classes, prior.mean.T, np.stack([np.diag(variance)] * 2), config.iterations
+        phi,
+        classes,
+        np.stack([own.mean for own in prior]),
+        np.stack([np.diag(variance)] * 2),
+        config.iterations,
     )
 
 

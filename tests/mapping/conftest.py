@@ -28,11 +28,16 @@ class Problem:
     prior_mean: np.ndarray
     variance: np.ndarray
 
-    def fit(self, iterations: int = 4, updates: int = 1, relaxation: float = 1.0) -> Posterior:
-        prior = diagonal_prior(self.space, self.prior_mean, self.variance)
+    members: np.ndarray | None = None
+
+    def fit(
+        self, iterations: int = 4, updates: int = 1, relaxation: float = 1.0,
+        tolerance: float = 0.0, offset: np.ndarray | None = None,
+    ) -> Posterior:  # fmt: skip
+        prior = diagonal_prior(self.space, self.prior_mean, self.variance, self.members)
         return fit_weights(
-            self.space, block_features(self.space, self.points), self.labels, prior,
-            iterations=iterations, variational_updates=updates, relaxation=relaxation,
+            block_features(self.space, self.points), self.labels, prior, iterations=iterations,
+            variational_updates=updates, relaxation=relaxation, tolerance=tolerance, offset=offset,
         )  # fmt: skip
 
 

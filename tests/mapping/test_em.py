@@ -8,21 +8,24 @@ from hypothesis import strategies as st
 from oracles import dense_em
 
 from vprism_plan.errors import MapError
-from vprism_plan.mapping.em import bouchard_lambda, diagonal_prior, fit_weights
-from vprism_plan.mapping.factors import dense_class
-from vprism_plan.mapping.features import block_features
+from vprism_plan.mapping.em import bouchard_lambda
+from vprism_plan.mapping.factors import dense
 
 
-def dense_fit(problem, iterations, updates=1, radius=np.inf):
+def dense_fit(problem, iterations, updates=1, radius=np.inf, offset=None):
     phi = dense_em.features(problem.points, problem.space.hinges, problem.space.gamma, radius)
     prior = np.stack([np.diag(problem.variance)] * problem.classes)
-    mean = problem.prior_mean.T
-    return dense_em.fit(phi, problem.labels, mean, prior, iterations, updates)
+    mean, members = problem.prior_mean.T, problem.members
+    return dense_em.fit(phi, problem.labels, mean, prior, iterations, updates, offset, members)
 
 
-def covariances(space, posterior):
-    classes = posterior.mean.shape[1]
-    return np.stack([dense_class(space, posterior.covariance, k) for k in range(classes)])
+def covariances(posterior):
+    """Of all features; 0 where a class has none."""
+    size = posterior.classes[0].space.size
+    out = np.zeros((len(posterior.classes), size, size))
+    for matrix, own in zip(out, posterior.classes, strict=True):
+        matrix[np.ix_(own.members, own.members)] = dense(own.space, own.covariance)
+    return out
 
 
 def relative(a, b):
@@ -35,7 +38,7 @@ def test_agrees_with_the_textbook_without_a_cutoff(make, classes, updates):
     ours = problem.fit(4, updates)
     theirs = dense_fit(problem, 4, updates)
     assert relative(ours.mean.T, theirs.mean) < 1e-6
-    assert relative(covariances(problem.space, ours), theirs.covariance) < 1e-6
+    assert relative(covariances(ours), theirs.covariance) < 1e-6
     np.testing.assert_allclose(ours.history, theirs.bounds, rtol=1e-9)
 
 
@@ -44,17 +47,32 @@ def test_agrees_with_the_textbook_around_an_offset(make, classes):
     """What is added to the logits is learned around, as if it were a feature of weight 1."""
     problem = make(classes, classes, cutoff=0)
     offset = np.random.default_rng(classes).normal(scale=3.0, size=(len(problem.points), classes))
-    prior = diagonal_prior(problem.space, problem.prior_mean, problem.variance)
-    ours = fit_weights(
-        problem.space, block_features(problem.space, problem.points), problem.labels, prior,
-        iterations=4, variational_updates=2, offset=offset,
-    )  # fmt: skip
-    phi = dense_em.features(problem.points, problem.space.hinges, problem.space.gamma, np.inf)
-    dense = np.stack([np.diag(problem.variance)] * classes)
-    theirs = dense_em.fit(phi, problem.labels, problem.prior_mean.T, dense, 4, 2, offset)
+    ours = problem.fit(4, 2, offset=offset)
+    theirs = dense_fit(problem, 4, 2, offset=offset)
     assert relative(ours.mean.T, theirs.mean) < 1e-6
     np.testing.assert_allclose(ours.history, theirs.bounds, rtol=1e-9)
     assert (np.diff(ours.history) > 0).all()
+
+
+@pytest.mark.parametrize("cutoff", [0, 1e-5])
+def test_classes_with_hinges_of_their_own_agree_with_the_textbook(make, cutoff):
+    """The full model with features masked per class: the same posterior, bound and draws."""
+    problem = make(5, 4, n=200, hinges=40, cutoff=cutoff)
+    rng = np.random.default_rng(0)
+    problem.members = rng.random((4, problem.space.size)) < 0.5
+    problem.members[0], problem.members[:, -1] = True, True
+    problem.members[3, :-1] = False  # a class that no hinge is near: the bias alone
+    offset = rng.normal(size=(200, 4))
+    ours = problem.fit(4, 2, offset=offset)
+    theirs = dense_fit(problem, 4, 2, problem.space.radius, offset)
+    masked = np.where(problem.members, theirs.mean, 0.0)
+    assert relative(ours.mean.T, masked) < 1e-6
+    for own, expected in zip(ours.classes, theirs.covariance, strict=True):
+        rows, columns = own.space.pairs.T
+        found = own.covariance[own.space.base[rows] + columns]
+        wanted = expected[own.members[rows], own.members[columns]]
+        assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max()
+    np.testing.assert_allclose(ours.history, theirs.bounds, rtol=1e-9)
 
 
 def test_agrees_with_the_textbook_at_the_same_cutoff(make):
@@ -63,7 +81,7 @@ def test_agrees_with_the_textbook_at_the_same_cutoff(make):
     ours, theirs = problem.fit(3), dense_fit(problem, 3, radius=problem.space.radius)
     assert problem.space.envelope_size < problem.space.size * (problem.space.size + 1) // 2
     assert relative(ours.mean.T, theirs.mean) < 1e-6
-    sparse = covariances(problem.space, ours)
+    sparse = covariances(ours)
     index = np.arange(problem.space.size)
     stored = index[None, :] >= problem.space.row_first[:, None]
     stored = np.where(index[None, :] <= index[:, None], stored, stored.T)
@@ -85,7 +103,7 @@ def test_effect_of_the_cutoff_is_bounded(make, seed):
             query, problem.space.hinges, problem.space.gamma, problem.space.radius
         )
         posterior = problem.fit(4)
-        sigma = covariances(problem.space, posterior)
+        sigma = covariances(posterior)
         answers.append(dense_em.predict(phi, posterior.mean.T, sigma))
     assert np.abs(answers[0] - answers[1]).max() < 2e-3
 
@@ -138,7 +156,7 @@ def test_order_of_points_does_not_matter(make):
     problem.points, problem.labels = problem.points[order], problem.labels[order]
     second = problem.fit()
     np.testing.assert_allclose(second.mean, first.mean, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(second.covariance, first.covariance, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(covariances(second), covariances(first), rtol=1e-8, atol=1e-8)
 
 
 def test_order_of_classes_does_not_matter(make):
@@ -149,7 +167,7 @@ def test_order_of_classes_does_not_matter(make):
     problem.prior_mean = problem.prior_mean[:, np.argsort(swap)]
     second = problem.fit()
     np.testing.assert_allclose(second.mean[:, swap], first.mean, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(second.covariance[:, swap], first.covariance, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(covariances(second)[swap], covariances(first), rtol=1e-8, atol=1e-8)
 
 
 def test_number_of_threads_does_not_change_a_bit(make, monkeypatch):
@@ -159,7 +177,7 @@ def test_number_of_threads_does_not_change_a_bit(make, monkeypatch):
         monkeypatch.setenv("VPRISM_PLAN_THREADS", threads)
         results.append(problem.fit())
     np.testing.assert_array_equal(results[0].mean, results[1].mean)
-    np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
+    np.testing.assert_array_equal(covariances(results[0]), covariances(results[1]))
 
 
 def test_huge_logits_stay_finite(make):
@@ -172,11 +190,7 @@ def test_huge_logits_stay_finite(make):
 
 def test_a_tolerance_stops_early(make):
     problem = make(7, 3)
-    prior = diagonal_prior(problem.space, problem.prior_mean, problem.variance)
-    features = block_features(problem.space, problem.points)
-    posterior = fit_weights(
-        problem.space, features, problem.labels, prior, iterations=200, tolerance=1e-3
-    )
+    posterior = problem.fit(200, tolerance=1e-3)
     assert 2 <= len(posterior.history) < 100
 
 

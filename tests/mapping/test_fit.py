@@ -128,22 +128,26 @@ def test_an_update_keeps_old_hinges_and_gives_new_ground_the_prior(small_map):
     space = FeatureSpace(sorted_hinges(np.concatenate([old.hinges, extra])), old.gamma, old.radius)
     flat = weight_prior(space, small_map.config, small_map.n_classes)
     prior = expand_prior(old, small_map.posterior, space, flat)
-    from vprism_plan.mapping.factors import dense_class
+    from vprism_plan.mapping.factors import dense
 
     order = [int(np.flatnonzero((space.hinges == h).all(1))[0]) for h in old.hinges]
     order.append(space.size - 1)
     fresh = [i for i in range(space.size) if i not in order]
-    for k in range(small_map.n_classes):
-        new, before = (
-            dense_class(space, prior.precision, k),
-            dense_class(old, small_map.posterior.precision, k),
-        )
-        np.testing.assert_array_equal(new[np.ix_(order, order)], before)
+    for own, was in zip(prior, small_map.posterior.classes, strict=True):
+        new, before = dense(space, own.precision), dense(was.space, was.precision)
+        kept = np.array(order)[was.members]
+        np.testing.assert_array_equal(new[np.ix_(kept, kept)], before)
         variance = small_map.config.weight_variance
         np.testing.assert_allclose(new[np.ix_(fresh, fresh)], np.eye(2) / variance)
         assert (new[np.ix_(order, fresh)] == 0).all()
-        assert prior.log_determinant[k] == pytest.approx(np.linalg.slogdet(new)[1], rel=1e-9)
-    np.testing.assert_array_equal(prior.mean[order], small_map.posterior.mean)
+        assert own.log_determinant == pytest.approx(np.linalg.slogdet(new)[1], rel=1e-9)
+        np.testing.assert_array_equal(own.mean[kept], was.mean)
+        # Of a covariance only what points that see both hinges ask for.
+        rows, columns = was.space.pairs.T
+        np.testing.assert_array_equal(
+            dense(space, own.covariance)[kept[rows], kept[columns]],
+            dense(was.space, was.covariance)[rows, columns],
+        )
 
 
 def test_an_update_with_a_new_object_fits_all_views_again(scene, coarse):

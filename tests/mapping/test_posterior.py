@@ -7,15 +7,16 @@ import torch
 from oracles import dense_em
 
 from vprism_plan.errors import MapError
-from vprism_plan.mapping.factors import dense_class
+from vprism_plan.mapping.factors import dense
 
 QUESTIONS = ("predict_proba", "occupancy", "entropy", "support")
 
 
 def dense_posterior(fitted):
-    classes = range(fitted.n_classes)
-    sigma = [dense_class(fitted.space, fitted.posterior.covariance, k) for k in classes]
-    return fitted.posterior.mean.T, np.stack(sigma)
+    sigma = np.zeros((fitted.n_classes, fitted.space.size, fitted.space.size))
+    for matrix, own in zip(sigma, fitted.posterior.classes, strict=True):
+        matrix[np.ix_(own.members, own.members)] = dense(own.space, own.covariance)
+    return fitted.posterior.mean.T, sigma
 
 
 def test_rows_sum_to_one(small_map, query):

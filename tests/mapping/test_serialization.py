@@ -127,10 +127,11 @@ def test_another_version_and_damage_are_named(saved, tmp_path):
     path = tmp_path / "m.safetensors"
     with pytest.raises(MapError, match="version"):
         load_map(rewrite(saved, path, {"version": FORMAT_VERSION + 1}))
-    with pytest.raises(MapError, match="covariance"):
-        load_map(rewrite(saved, path, covariance=np.zeros((3, 3))))
-    with pytest.raises(MapError, match="mean"):
-        load_map(rewrite(saved, path, mean=np.full_like(load_map(saved).posterior.mean, np.nan)))
+    with pytest.raises(MapError, match="precision"):
+        load_map(rewrite(saved, path, **{"class1.precision": np.zeros((3, 3))}))
+    nowhere = np.full_like(load_map(saved).posterior.classes[2].mean, np.nan)
+    with pytest.raises(MapError, match=r"class2\.mean"):
+        load_map(rewrite(saved, path, **{"class2.mean": nowhere}))
     with pytest.raises(MapError, match="damaged"):
         load_map(rewrite(saved, path, hinges=None))
     with pytest.raises(MapError, match="damaged"):
@@ -198,18 +199,19 @@ def test_parts_that_do_not_fit_together_are_named(saved, tmp_path, name):
         load_map(rewrite(saved, tmp_path / "m.safetensors", meta, **tensors))
 
 
-def test_covariances_of_another_posterior_are_refused(saved, tmp_path):
-    path, loaded = tmp_path / "m.safetensors", load_map(saved)
-    posterior = loaded.posterior
-    diagonal = loaded.space.diagonal
-    negative = posterior.covariance.copy()
-    negative[diagonal[3], 1] *= -1.0
-    with pytest.raises(MapError, match="not positive"):
-        load_map(rewrite(saved, path, covariance=negative))
-    with pytest.raises(MapError, match="not of one posterior"):
-        load_map(rewrite(saved, path, covariance=1e-3 * posterior.covariance))
-    with pytest.raises(MapError, match="not of one posterior"):
-        load_map(rewrite(saved, path, log_determinant=posterior.log_determinant + 1e5))
+def test_precisions_of_no_posterior_are_refused(saved, tmp_path):
+    path = tmp_path / "m.safetensors"
+    (own, space) = (load_map(saved).posterior.classes[1], load_map(saved).space)
+    rows, columns = own.space.pairs.T
+    values = own.precision[own.space.base[rows] + columns]
+    with pytest.raises(MapError, match="not positive definite"):
+        load_map(rewrite(saved, path, **{"class1.precision": -values}))
+    for wrong in ([3, 1, space.size - 1], [-1, space.size - 1], [0, 1]):
+        with pytest.raises(MapError, match=r"class1\.members"):
+            load_map(rewrite(saved, path, **{"class1.members": np.array(wrong, np.int32)}))
+    some = {f"class0.{name}": np.zeros(0, np.int32) for name in ("members", "mean", "precision")}
+    with pytest.raises(MapError):
+        load_map(rewrite(saved, path, **some))
 
 
 def test_hinges_whose_pairs_would_fill_the_memory_are_refused(saved, tmp_path):

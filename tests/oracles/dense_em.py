@@ -54,17 +54,25 @@ def fit(
     iterations: int,
     variational_updates: int = 1,
     offset: np.ndarray | None = None,
+    members: np.ndarray | None = None,
 ) -> DensePosterior:
-    """Algorithm 1. `prior_mean` (K, M), `prior_covariance` (K, M, M); z = offset + phi W."""
+    """Algorithm 1. `prior_mean` (K, M), `prior_covariance` (K, M, M); z = offset + phi W.
+
+    `members` (K, M): features that a class does not have are 0 for it. Around an offset it
+    starts from the alpha and xi of logits of that mean and variance 1, else from xi = 1.
+    """
     n, size = phi.shape
     classes = len(prior_mean)
     y = np.eye(classes)[labels]
+    own = np.ones((classes, size)) if members is None else members.astype(float)
+    mean = np.array(prior_mean, dtype=float)
+    covariance = np.array(prior_covariance, dtype=float)
     xi = np.ones((n, classes))
     alpha = np.zeros(n)
-    mean = np.empty((classes, size))
-    covariance = np.empty((classes, size, size))
     bounds = []
     o = np.zeros((n, classes)) if offset is None else offset
+    for _ in range(0 if offset is None else variational_updates):
+        alpha, xi = climb(o, np.ones_like(o), xi)
     for _ in range(iterations):
         weight = np.vectorize(lam)(xi)
         for k in range(classes):
@@ -72,23 +80,35 @@ def fit(
             precision = prior_precision.copy()
             information = prior_precision @ prior_mean[k]
             for i in range(n):
-                precision += 2.0 * weight[i, k] * np.outer(phi[i], phi[i])
+                f = own[k] * phi[i]
+                precision += 2.0 * weight[i, k] * np.outer(f, f)
                 linear = y[i, k] - 0.5 + 2.0 * (alpha[i] - o[i, k]) * weight[i, k]
-                information = information + linear * phi[i]
+                information = information + linear * f
             covariance[k] = np.linalg.inv(precision)
             mean[k] = np.linalg.solve(precision, information)
-        m = o + phi @ mean.T
-        v = np.stack([np.einsum("im,mj,ij->i", phi, s, phi) for s in covariance], axis=1)
+        m = o + phi @ (own * mean).T
+        v = np.stack(
+            [np.einsum("im,mj,ij->i", phi * f, s, phi * f)
+             for f, s in zip(own, covariance, strict=True)], axis=1,
+        )  # fmt: skip
         for _ in range(variational_updates):
-            weight = np.vectorize(lam)(xi)
-            for i in range(n):
-                top = 0.5 * (classes / 2.0 - 1.0) + (weight[i] * m[i]).sum()
-                alpha[i] = top / weight[i].sum()
-                xi[i] = np.sqrt(v[i] + m[i] ** 2 + alpha[i] ** 2 - 2.0 * alpha[i] * m[i])
+            alpha, xi = climb(m, v, xi)
         bounds.append(
             bound(y, m, v, alpha, xi) - kl(mean, covariance, prior_mean, prior_covariance)
         )
     return DensePosterior(mean, covariance, bounds)
+
+
+def climb(m: np.ndarray, v: np.ndarray, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The updates of alpha and xi for logits with these moments."""
+    weight = np.vectorize(lam)(xi)
+    alpha = np.empty(len(m))
+    new = np.empty_like(xi)
+    for i in range(len(m)):
+        top = 0.5 * (m.shape[1] / 2.0 - 1.0) + (weight[i] * m[i]).sum()
+        alpha[i] = top / weight[i].sum()
+        new[i] = np.sqrt(v[i] + m[i] ** 2 + alpha[i] ** 2 - 2.0 * alpha[i] * m[i])
+    return alpha, new
 
 
 def bound(y: np.ndarray, m: np.ndarray, v: np.ndarray, alpha: np.ndarray, xi: np.ndarray) -> float:

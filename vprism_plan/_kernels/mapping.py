@@ -2,10 +2,11 @@
 """Compiled inner loops of the map: sampling, sparse features, Gram blocks, predictions.
 
 Symmetric matrices live in an *envelope*: row i of the lower triangle is stored from
-its first column to the diagonal, so entry (i, j) of class k is `data[base[i] + j, k]`,
-one addition away. The bias is the last row and column. Points come in *blocks* of
-neighbours that share one list of hinges; a hinge out of a point's reach has the feature
-value 0 exactly, so a result does not depend on which points share its block.
+its first column to the diagonal, so entry (i, j) is `data[base[i] + j]`, one addition
+away. The bias is the last row and column. Every class has hinges and matrices of its own.
+Points come in *blocks* of neighbours that share one list of hinges; a hinge out of a point's
+reach has the feature value 0 exactly, so a result does not depend on which points share its
+block.
 """
 
 import math
@@ -26,9 +27,10 @@ _PARTS = BLOCK // _LANES
 # ---------------------------------------------------------------- vector loops
 # The compiler does not keep accumulators in registers across a loop over array memory,
 # which costs a factor of four here. These two loops are therefore spelled out: all
-# arguments are addresses and counts, `classes` of them are handled per call, and each
-# of the 16 points of a block is one vector lane, so no sum depends on its neighbours.
+# arguments are addresses and counts, `_ROWS` rows of a matrix are handled per call, and
+# each of the 16 points of a block is one vector lane, so no sum depends on its neighbours.
 _VECTOR = ir.VectorType(ir.DoubleType(), _LANES)
+_ROWS = 4  # rows that share one pass over the features
 
 
 def _at(builder, address, offset, kind):
@@ -59,14 +61,22 @@ def _spread(builder, scalar):
     return builder.shuffle_vector(one, one, mask)
 
 
-def _make_row_products(classes):
-    """out[k, p] = sum_j matrix[(entry + own[j]) * stride + k] phi[j, p], first <= j < last."""
+def _load_entries(builder, entries, rows, whole):
+    """Where each of some rows starts in its matrix, from an array of int64."""
+    return [
+        builder.load(_at(builder, entries, ir.Constant(whole, row), whole)) for row in range(rows)
+    ]
+
+
+def _make_row_products(rows):
+    """out[r, p] = sum_j matrix[entries[r] + own[j]] phi[j, p], first <= j < last."""
 
     @intrinsic
-    def row_products(typingctx, matrix, entry, stride, own, first, last, phi, out):
+    def row_products(typingctx, matrix, entries, own, first, last, phi, out):
         def codegen(context, builder, signature, args):
-            matrix, entry, stride, own, first, last, phi, out = args
+            matrix, entries, own, first, last, phi, out = args
             whole = first.type
+            starts = _load_entries(builder, entries, rows, whole)
             before = builder.block
             loop = builder.append_basic_block("row_loop")
             done = builder.append_basic_block("row_done")
@@ -75,17 +85,16 @@ def _make_row_products(classes):
             builder.position_at_end(loop)
             j = builder.phi(whole)
             j.add_incoming(first, before)
-            sums = [builder.phi(_VECTOR) for _ in range(classes * _PARTS)]
+            sums = [builder.phi(_VECTOR) for _ in range(rows * _PARTS)]
             column = builder.load(_at(builder, own, j, whole))
-            at = builder.mul(builder.add(entry, column), stride)
             values = _load_parts(builder, phi, builder.mul(j, ir.Constant(whole, BLOCK)))
             updated = []
-            for k in range(classes):
-                place = builder.add(at, ir.Constant(whole, k))
+            for r in range(rows):
+                place = builder.add(starts[r], column)
                 scalar = builder.load(_at(builder, matrix, place, ir.DoubleType()))
                 spread = _spread(builder, scalar)
                 for part in range(_PARTS):
-                    total = sums[k * _PARTS + part]
+                    total = sums[r * _PARTS + part]
                     updated.append(_fused(builder, spread, values[part], total))
             following = builder.add(j, ir.Constant(whole, 1))
             builder.cbranch(builder.icmp_signed("<", following, last), loop, done)
@@ -103,22 +112,23 @@ def _make_row_products(classes):
                 builder.store(result, _at(builder, out, at, _VECTOR), align=8)
             return context.get_dummy_value()
 
-        return types.void(*[types.intp] * 8), codegen
+        return types.void(*[types.intp] * 7), codegen
 
     return row_products
 
 
-def _make_gram_products(classes):
-    """matrix[(entry + own[j]) * stride + k] += sum_p scaled[k, p] phi[j, p], first <= j < last."""
+def _make_gram_products(rows):
+    """matrix[entries[r] + own[j]] += sum_p scaled[r, p] phi[j, p], first <= j < last."""
 
     @intrinsic
-    def gram_products(typingctx, matrix, entry, stride, own, first, last, phi, scaled):
+    def gram_products(typingctx, matrix, entries, own, first, last, phi, scaled):
         def codegen(context, builder, signature, args):
-            matrix, entry, stride, own, first, last, phi, scaled = args
+            matrix, entries, own, first, last, phi, scaled = args
             whole = first.type
             double = ir.DoubleType()
+            starts = _load_entries(builder, entries, rows, whole)
             weights = [
-                _load_parts(builder, scaled, ir.Constant(whole, k * BLOCK)) for k in range(classes)
+                _load_parts(builder, scaled, ir.Constant(whole, r * BLOCK)) for r in range(rows)
             ]
             add_all = cgutils.get_or_insert_function(
                 builder.module,
@@ -129,65 +139,26 @@ def _make_gram_products(classes):
                 builder, first, last, ir.Constant(whole, 1), intp=whole
             ) as (j, _):
                 column = builder.load(_at(builder, own, j, whole))
-                at = builder.mul(builder.add(entry, column), stride)
                 values = _load_parts(builder, phi, builder.mul(j, ir.Constant(whole, BLOCK)))
-                for k in range(classes):
-                    total = builder.fmul(weights[k][0], values[0])
+                for r in range(rows):
+                    total = builder.fmul(weights[r][0], values[0])
                     for part in range(1, _PARTS):
-                        total = _fused(builder, weights[k][part], values[part], total)
+                        total = _fused(builder, weights[r][part], values[part], total)
                     # "reassoc" lets the lanes be added as a tree: a fixed order all the same.
                     one = builder.call(
                         add_all, [ir.Constant(double, 0.0), total], fastmath=("reassoc",)
                     )
-                    place = _at(builder, matrix, builder.add(at, ir.Constant(whole, k)), double)
+                    place = _at(builder, matrix, builder.add(starts[r], column), double)
                     builder.store(builder.fadd(builder.load(place), one), place)
             return context.get_dummy_value()
 
-        return types.void(*[types.intp] * 8), codegen
+        return types.void(*[types.intp] * 7), codegen
 
     return gram_products
 
 
-_row_products_4, _row_products_2, _row_products_1 = map(_make_row_products, (4, 2, 1))
-_gram_products_4, _gram_products_2, _gram_products_1 = map(_make_gram_products, (4, 2, 1))
-
-
-@njit(cache=True, nogil=True, fastmath=False)
-def _row_products(matrix, entry, own, first, last, phi, out):
-    """out[k, p] = sum over first <= j < last of matrix[entry + own[j], k] phi[j, p]."""
-    K = matrix.shape[1]
-    k = 0
-    while k < K:
-        at = matrix.ctypes.data + 8 * k
-        to = out.ctypes.data + 8 * BLOCK * k
-        if K - k >= 4:
-            _row_products_4(at, entry, K, own.ctypes.data, first, last, phi.ctypes.data, to)
-            k += 4
-        elif K - k >= 2:
-            _row_products_2(at, entry, K, own.ctypes.data, first, last, phi.ctypes.data, to)
-            k += 2
-        else:
-            _row_products_1(at, entry, K, own.ctypes.data, first, last, phi.ctypes.data, to)
-            k += 1
-
-
-@njit(cache=True, nogil=True, fastmath=False)
-def _gram_products(matrix, entry, own, first, last, phi, scaled):
-    """matrix[entry + own[j], k] += sum_p scaled[k, p] phi[j, p] for first <= j < last."""
-    K = matrix.shape[1]
-    k = 0
-    while k < K:
-        to = matrix.ctypes.data + 8 * k
-        at = scaled.ctypes.data + 8 * BLOCK * k
-        if K - k >= 4:
-            _gram_products_4(to, entry, K, own.ctypes.data, first, last, phi.ctypes.data, at)
-            k += 4
-        elif K - k >= 2:
-            _gram_products_2(to, entry, K, own.ctypes.data, first, last, phi.ctypes.data, at)
-            k += 2
-        else:
-            _gram_products_1(to, entry, K, own.ctypes.data, first, last, phi.ctypes.data, at)
-            k += 1
+_row_products_4, _row_products_1 = map(_make_row_products, (_ROWS, 1))
+_gram_products_4, _gram_products_1 = map(_make_gram_products, (_ROWS, 1))
 
 
 # ---------------------------------------------------------------- negative samples
@@ -442,13 +413,15 @@ def block_features(
 # ---------------------------------------------------------------- learning
 @njit(cache=True, nogil=True, fastmath=False)
 def gram_rows(block_start, near_start, near, phi_all, weights, row_first, base, lo, hi, out):
-    """Add sum_p weights[p, k] phi_i phi_j to the envelope rows lo..hi, all classes at once.
+    """Add sum_p weights[p] phi_i phi_j to the envelope rows lo..hi.
 
     Rows are owned by the caller, so threads need no locks and the order of every sum
     is that of the points, whatever the number of threads.
     """
-    K = weights.shape[1]
-    scaled = np.zeros((K, BLOCK))
+    scaled = np.zeros((_ROWS, BLOCK))
+    entries = np.empty(_ROWS, np.int64)
+    own_first = np.empty(_ROWS, np.int64)
+    to, entry_at, scaled_at = out.ctypes.data, entries.ctypes.data, scaled.ctypes.data
     for b in range(len(block_start) - 1):
         start = block_start[b]
         size = block_start[b + 1] - start
@@ -456,81 +429,108 @@ def gram_rows(block_start, near_start, near, phi_all, weights, row_first, base, 
         phi = phi_all[near_start[b] : near_start[b + 1]]
         first = np.searchsorted(own, lo)
         last = np.searchsorted(own, hi)
-        for p in range(size, BLOCK):
-            for k in range(K):
-                scaled[k, p] = 0.0
-        for i in range(first, last):
-            row = own[i]
-            used = False
-            for p in range(size):
-                f = phi[i, p]
-                used |= f != 0.0
-                for k in range(K):
-                    scaled[k, p] = weights[start + p, k] * f
-            if used:
+        scaled[:, size:] = 0.0
+        columns = own.ctypes.data
+        values = phi.ctypes.data
+        i = first
+        while i < last:
+            rows = _ROWS if i + _ROWS <= last else 1
+            begin = 0
+            for r in range(rows):
+                row = own[i + r]
+                entries[r] = base[row]
                 # Hinges before the envelope are too far apart for any point to see both.
-                j = np.searchsorted(own, row_first[row])
-                _gram_products(out, base[row], own, j, i + 1, phi, scaled)
+                own_first[r] = np.searchsorted(own, row_first[row])
+                begin = max(begin, own_first[r])
+                for p in range(size):
+                    scaled[r, p] = weights[start + p] * phi[i + r, p]
+            begin = i if rows == 1 else min(begin, i)
+            if rows > 1:
+                _gram_products_4(to, entry_at, columns, begin, i, values, scaled_at)
+            # What the rows do not share: entries before `begin`, and their own triangle.
+            for r in range(rows):
+                one, by = entry_at + 8 * r, scaled_at + 8 * BLOCK * r
+                _gram_products_1(to, one, columns, own_first[r], begin, values, by)
+                at = max(own_first[r], i)
+                _gram_products_1(to, one, columns, at, i + r + 1, values, by)
+            i += rows
 
 
 @njit(cache=True, nogil=True, fastmath=False)
 def feature_sums(block_start, near_start, near, phi_all, weights, out):
-    """out[h, k] += sum_p weights[p, k] phi_h(p)."""
-    K = weights.shape[1]
+    """out[h] += sum_p weights[p] phi_h(p)."""
     for b in range(len(block_start) - 1):
         start = block_start[b]
         size = block_start[b + 1] - start
         for u in range(near_start[b], near_start[b + 1]):
+            total = 0.0
             for p in range(size):
-                f = phi_all[u, p]
-                if f != 0.0:
-                    for k in range(K):
-                        out[near[u], k] += f * weights[start + p, k]
+                total += phi_all[u, p] * weights[start + p]
+            out[near[u]] += total
 
 
 @njit(cache=True, nogil=True, fastmath=False)
 def _block_moments(own, phi, mean, cov, row_first, base, partial, m_out, v_out):
-    """Mean and variance (K, BLOCK) of the logits of one block; `partial` is scratch."""
-    K = mean.shape[1]
-    for k in range(K):
-        for p in range(BLOCK):
-            m_out[k, p] = 0.0
-            v_out[k, p] = 0.0
-    for i in range(len(own)):
-        row = own[i]
-        j = np.searchsorted(own, row_first[row])
-        _row_products(cov, base[row], own, j, i, phi, partial)
-        diagonal = base[row] + row
-        for k in range(K):
-            s = cov[diagonal, k]
-            w = mean[row, k]
+    """Mean and variance (BLOCK,) of the logits of one block; `partial` (4, BLOCK) is scratch."""
+    entries = np.empty(_ROWS, np.int64)
+    m_out[:] = 0.0
+    v_out[:] = 0.0
+    n = len(own)
+    i = 0
+    while i < n:
+        # The last row, the bias's, reaches farther back than any other.
+        rows = _ROWS if i + _ROWS < n else 1
+        begin = n
+        for r in range(rows):
+            row = own[i + r]
+            entries[r] = base[row]
+            begin = min(begin, np.searchsorted(own, row_first[row]))
+        # Of a pair outside the envelope some other finite entry is read: no point sees both
+        # hinges, so that it is multiplied by 0 here or below.
+        if rows == 1:
+            _row_products_1(
+                cov.ctypes.data, entries.ctypes.data, own.ctypes.data, begin, i,
+                phi.ctypes.data, partial.ctypes.data,
+            )  # fmt: skip
+        else:
+            _row_products_4(
+                cov.ctypes.data, entries.ctypes.data, own.ctypes.data, begin, i,
+                phi.ctypes.data, partial.ctypes.data,
+            )  # fmt: skip
+        for r in range(rows):
+            row = own[i + r]
+            for j in range(i, i + r):
+                s = cov[base[row] + own[j]]
+                for p in range(BLOCK):
+                    partial[r, p] += s * phi[j, p]
+            s = cov[base[row] + row]
+            w = mean[row]
             for p in range(BLOCK):
-                f = phi[i, p]
-                v_out[k, p] += f * (s * f + 2.0 * partial[k, p])
-                m_out[k, p] += w * f
-    for k in range(K):
-        for p in range(BLOCK):
-            v_out[k, p] = max(v_out[k, p], 0.0)
+                f = phi[i + r, p]
+                v_out[p] += f * (s * f + 2.0 * partial[r, p])
+                m_out[p] += w * f
+        i += rows
+    for p in range(BLOCK):
+        v_out[p] = max(v_out[p], 0.0)
 
 
 @njit(cache=True, nogil=True, fastmath=False)
 def stored_moments(
-    block_start, near_start, near, phi_all, lo, hi, mean, cov, row_first, base, mean_out, var_out
-):
-    """Logit moments (points, K) of the blocks lo..hi whose features are stored."""
-    K = mean.shape[1]
-    partial = np.empty((K, BLOCK))
-    m = np.empty((K, BLOCK))
-    v = np.empty((K, BLOCK))
+    block_start, near_start, near, phi_all, lo, hi, mean, cov, row_first, base, k,
+    mean_out, var_out,
+):  # fmt: skip
+    """Logit moments of class k, column k of (points, K), in blocks lo..hi with stored features."""
+    partial = np.empty((_ROWS, BLOCK))
+    m = np.empty(BLOCK)
+    v = np.empty(BLOCK)
     for b in range(lo, hi):
         start = block_start[b]
         own = near[near_start[b] : near_start[b + 1]]
         phi = phi_all[near_start[b] : near_start[b + 1]]
         _block_moments(own, phi, mean, cov, row_first, base, partial, m, v)
         for p in range(block_start[b + 1] - start):
-            for k in range(K):
-                mean_out[start + p, k] = m[k, p]
-                var_out[start + p, k] = v[k, p]
+            mean_out[start + p, k] = m[p]
+            var_out[start + p, k] = v[p]
 
 
 # ---------------------------------------------------------------- prediction
@@ -538,54 +538,56 @@ def stored_moments(
 def point_moments(
     points, order, block_start, lo, hi, hinges,
     cell_start, cell_items, grid_lower, cell, shape, radius, gamma, reach,
-    mean, cov, row_first, base, mean_out, var_out, support_out,
+    mean, cov, row_first, base, k, mean_out, var_out, support_out,
 ):  # fmt: skip
-    """Logit moments and kernel mass of the points of blocks lo..hi."""
-    K = mean.shape[1]
+    """Logit moments of class k, and the mass of its kernels, at the points of blocks lo..hi.
+
+    What no hinge of the class reaches is left as it is.
+    """
     near = np.empty(len(hinges) + 1, np.int64)
     lower = np.empty(3)
     upper = np.empty(3)
     phi = np.empty((len(hinges) + 1, BLOCK))
-    partial = np.empty((K, BLOCK))
-    m = np.empty((K, BLOCK))
-    v = np.empty((K, BLOCK))
+    partial = np.empty((_ROWS, BLOCK))
+    m = np.empty(BLOCK)
+    v = np.empty(BLOCK)
     for b in range(lo, hi):
         start = block_start[b]
         stop = block_start[b + 1]
-        size = stop - start
         _block_box(points, order, start, stop, lower, upper)
         n = _near_box(
             lower, upper, hinges, cell_start, cell_items, grid_lower, cell, shape, radius, near
         )
+        if n == 0:
+            continue
         _fill_features(points, order, start, stop, hinges, near, n, gamma, reach, phi)
-        _block_moments(
-            near[: n + 1], phi, mean, cov, row_first, base, partial, m, v
-        )  # fmt: skip
-        for p in range(size):
+        _block_moments(near[: n + 1], phi, mean, cov, row_first, base, partial, m, v)
+        for p in range(stop - start):
             q = order[start + p]
             total = 0.0
             for u in range(n):
                 total += phi[u, p]
             support_out[q] = total
-            for k in range(K):
-                mean_out[q, k] = m[k, p]
-                var_out[q, k] = v[k, p]
+            mean_out[q, k] = m[p]
+            var_out[q, k] = v[p]
 
 
 @njit(cache=True, nogil=True, fastmath=False)
 def point_jacobians(
     points, lo, hi, hinges,
     cell_start, cell_items, grid_lower, cell, shape, radius, gamma, reach,
-    mean, cov, row_first, base, mean_out, var_out, support_out,
+    mean, cov, row_first, base, k, mean_out, var_out, support_out,
     mean_grad, var_grad, support_grad,
 ):  # fmt: skip
-    """Moments of the points lo..hi with their gradients: (n, K, 3), (n, K, 3), (n, 3)."""
-    K = mean.shape[1]
+    """Moments of class k at the points lo..hi with their gradients: (n, K, 3), (n, K, 3), (n, 3).
+
+    The outputs start as zeros.
+    """
     near = np.empty(len(hinges) + 1, np.int64)
     active = np.empty(len(hinges) + 1, np.int64)
     phi = np.empty(len(hinges) + 1)
     slope = np.zeros((len(hinges) + 1, 3))
-    product = np.empty((len(hinges) + 1, K))
+    product = np.empty(len(hinges) + 1)
     for q in range(lo, hi):
         n = _near_box(
             points[q], points[q], hinges, cell_start, cell_items, grid_lower, cell, shape,
@@ -615,32 +617,22 @@ def point_jacobians(
         for a in range(3):
             slope[count, a] = 0.0
         for i in range(count + 1):
-            for k in range(K):
-                product[i, k] = 0.0
-        for i in range(count + 1):
             row = active[i]
+            product[i] = cov[base[row] + row] * phi[i]
             for j in range(i):
-                entry = base[row] + active[j]
-                for k in range(K):
-                    s = cov[entry, k]
-                    product[i, k] += s * phi[j]
-                    product[j, k] += s * phi[i]
-            for k in range(K):
-                product[i, k] += cov[base[row] + row, k] * phi[i]
-        for k in range(K):
-            m = 0.0
-            v = 0.0
+                s = cov[base[row] + active[j]]
+                product[i] += s * phi[j]
+                product[j] += s * phi[i]
+        m = 0.0
+        v = 0.0
+        for i in range(count + 1):
+            m += mean[active[i]] * phi[i]
+            v += product[i] * phi[i]
             for a in range(3):
-                mean_grad[q, k, a] = 0.0
-                var_grad[q, k, a] = 0.0
-            for i in range(count + 1):
-                m += mean[active[i], k] * phi[i]
-                v += product[i, k] * phi[i]
-                for a in range(3):
-                    mean_grad[q, k, a] += mean[active[i], k] * slope[i, a]
-                    var_grad[q, k, a] += 2.0 * product[i, k] * slope[i, a]
-            mean_out[q, k] = m
-            var_out[q, k] = max(v, 0.0)
+                mean_grad[q, k, a] += mean[active[i]] * slope[i, a]
+                var_grad[q, k, a] += 2.0 * product[i] * slope[i, a]
+        mean_out[q, k] = m
+        var_out[q, k] = max(v, 0.0)
 
 
 @njit(cache=True, nogil=True, fastmath=False)
@@ -720,51 +712,41 @@ def normalised_log_probabilities(mean, var, lo, hi, out):
 
 # ---------------------------------------------------------------- envelopes
 @njit(cache=True, nogil=True, fastmath=False)
-def unpack(data, k, row_first, base, out):
-    """Class k's symmetric matrix into the dense, zeroed `out`."""
+def unpack(data, row_first, base, out):
+    """A symmetric matrix into the dense, zeroed `out`."""
     for i in range(len(base)):
         for j in range(row_first[i], i + 1):
-            value = data[base[i] + j, k]
+            value = data[base[i] + j]
             out[i, j] = value
             out[j, i] = value
 
 
 @njit(cache=True, nogil=True, fastmath=False)
-def pack(dense, k0, row_first, base, data):
-    """Lower triangles of `dense` (n, M, M) into the classes k0, k0 + 1, ... of an envelope."""
+def pack(dense, row_first, base, data):
+    """The lower triangle of `dense` into an envelope."""
     for i in range(len(base)):
         for j in range(row_first[i], i + 1):
-            for k in range(len(dense)):
-                data[base[i] + j, k0 + k] = dense[k, i, j]
+            data[base[i] + j] = dense[i, j]
 
 
 @njit(cache=True, nogil=True, fastmath=False)
-def envelope_product(data, row_first, base, vectors, out):
-    """out = A x for every class: data (E, K), vectors and out (M, K)."""
-    M, K = vectors.shape
-    for i in range(M):
-        for k in range(K):
-            out[i, k] = 0.0
-    for i in range(M):
-        for j in range(row_first[i], i):
-            entry = base[i] + j
-            for k in range(K):
-                out[i, k] += data[entry, k] * vectors[j, k]
-                out[j, k] += data[entry, k] * vectors[i, k]
-        for k in range(K):
-            out[i, k] += data[base[i] + i, k] * vectors[i, k]
-
-
-@njit(cache=True, nogil=True, fastmath=False)
-def envelope_inner(a, b, row_first, base, out):
-    """out[k] = trace(A_k B_k) of two symmetric envelopes."""
-    K = a.shape[1]
-    for k in range(K):
-        out[k] = 0.0
+def envelope_product(data, row_first, base, vector, out):
+    """out = A x."""
+    out[:] = 0.0
     for i in range(len(base)):
         for j in range(row_first[i], i):
-            entry = base[i] + j
-            for k in range(K):
-                out[k] += 2.0 * a[entry, k] * b[entry, k]
-        for k in range(K):
-            out[k] += a[base[i] + i, k] * b[base[i] + i, k]
+            value = data[base[i] + j]
+            out[i] += value * vector[j]
+            out[j] += value * vector[i]
+        out[i] += data[base[i] + i] * vector[i]
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def envelope_inner(a, b, row_first, base):
+    """trace(A B) of two symmetric envelopes."""
+    total = 0.0
+    for i in range(len(base)):
+        for j in range(row_first[i], i):
+            total += 2.0 * a[base[i] + j] * b[base[i] + j]
+        total += a[base[i] + i] * b[base[i] + i]
+    return total

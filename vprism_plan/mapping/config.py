@@ -15,9 +15,10 @@ _POSITIVE = (
     "gamma", "hinge_spacing", "hinge_radius", "prior_logit_variance", "prior_weight_variance",
     "prior_seen_variance", "prior_hidden_variance", "bias_variance", "object_radius", "ray_step",
     "object_resolution", "empty_resolution", "front_distance", "front_resolution",
+    "start_variance",
 )  # fmt: skip
 _NOT_NEGATIVE = (
-    "hinge_margin", "hinge_depth", "hinge_reach", "tolerance", "below_plane_margin",
+    "hinge_margin", "hinge_depth", "hinge_reach", "class_reach", "tolerance", "below_plane_margin",
 )  # fmt: skip
 _WHOLE = {
     "surface_hinges": 0, "iterations": 1, "variational_updates": 1, "below_plane_samples": 0,
@@ -26,7 +27,7 @@ _WHOLE = {
 _OPTIONAL = frozenset(
     {"hinge_depth", "prior_logit_variance", "prior_weight_variance", "prior_occupancy"}
     | {"front_distance", "hinge_reach", "object_resolution", "empty_resolution"}
-    | {"prior_hidden_variance"}
+    | {"prior_hidden_variance", "class_reach"}
 )
 
 
@@ -63,6 +64,9 @@ class MapConfig:
             two kernel lengths, or surfaces move. None keeps all (the paper). A quarter of
             the lattice tells only what the depth image tells, and the fit's cost grows
             with the cube of its nodes.
+        class_reach: an object has the hinges at most this far from its box, m; elsewhere its
+            logit is its prior's, and only "empty" learns. None gives it all of them (the
+            paper).
         surface_hinges: random surface points taken as hinges, per object. Where the
             lattice is coarse they add detail; where it is fine they add prior variance
             in random places, and lose accuracy.
@@ -74,6 +78,8 @@ class MapConfig:
         relaxation: how many times as far as EM's own step every iteration goes (the
             paper: 1). At 1.9 six iterations reach the bound of fourteen; steps that
             lower the bound are taken back.
+        start_variance: variance that logits are first taken to have around a guess of the
+            hidden side, which starts EM near its end. Without a guess it starts from xi = 1.
         tolerance: stop when the bound rises by less than this share of itself.
         prior_logit_variance: prior variance v of one class's logit, averaged over a
             lattice cell. The weights get v / S, S = (pi / (2 gamma))^(3/2) / spacing^3,
@@ -117,13 +123,15 @@ class MapConfig:
     hinge_margin: float = 0.08
     hinge_depth: float | None = 0.05
     hinge_reach: float | None = 0.04
+    class_reach: float | None = 0.05
     box_trim: float = 0.01
     stray_share: float = 0.03
     surface_hinges: int = 0
     max_hinges: int = 6000
-    iterations: int = 6
+    iterations: int = 4
     variational_updates: int = 3
     relaxation: float = 1.9
+    start_variance: float = 10.0
     tolerance: float = 1e-5
     prior_logit_variance: float | None = 20.0
     prior_weight_variance: float | None = None
@@ -194,6 +202,7 @@ class MapConfig:
             hinge_margin=0.0,
             hinge_depth=None,
             hinge_reach=None,
+            class_reach=None,
             box_trim=0.0,
             stray_share=0.0,
             surface_hinges=32,
@@ -201,6 +210,7 @@ class MapConfig:
             iterations=3,
             variational_updates=1,
             relaxation=1.0,
+            start_variance=1.0,
             tolerance=0.0,
             prior_logit_variance=None,
             prior_weight_variance=1e4,

@@ -1,60 +1,94 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Softmax EM with Bouchard's bound (section IV, algorithm 1), sparse and in float64.
 
-Per iteration the cost is N n^2 K / 2 multiply-adds for the Gram blocks and as many for
-the quadratic forms (N points, n active hinges per point, K classes), plus one Cholesky
-factor and the inverse's envelope per class. Memory: two envelopes of E x K numbers
-(E <= M (M + 1) / 2) and one dense matrix.
+Classes are local: every class has hinge points of its own, "empty" all of them. Where a class
+has none, its logit is its prior's.
+
+Per iteration the cost is N n^2 / 2 multiply-adds for the Gram blocks and as many for the
+quadratic forms (N points, n active hinges per point and class), plus one Cholesky factor
+and the inverse's envelope per class. Memory: two envelopes per class and one dense matrix
+per thread.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+import torch
+from jaxtyping import Bool, Float, Int, Int64
+from scipy.optimize import brentq
 
 from vprism_plan._kernels import mapping as kernels
 from vprism_plan._threads import run_chunked, worker_count
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.factors import invert_classes
+from vprism_plan.mapping.factors import inverse, run_per_class
 from vprism_plan.mapping.features import BlockFeatures, FeatureSpace
+from vprism_plan.mapping.prediction import occupied_probability
 
 
 @dataclass(frozen=True, eq=False)
-class WeightPrior:
-    """Gaussian prior of every class's weights.
+class Weights:
+    """Gaussian of one class's weights.
 
     Attributes:
-        mean: (M, K).
-        precision: (E, K) envelope.
-        log_determinant: (K,) of the precision.
+        members: which features of the map the class has, sorted, the bias last.
+        space: these features.
+        mean: (m,).
+        precision, covariance: (e,) envelopes of `space`.
+        log_determinant: of the precision.
     """
 
-    mean: Float[np.ndarray, "m k"]
-    precision: Float[np.ndarray, "e k"]
-    log_determinant: Float[np.ndarray, " k"]
+    members: Int64[np.ndarray, " m"]
+    space: FeatureSpace
+    mean: Float[np.ndarray, " m"]
+    precision: Float[np.ndarray, " e"]
+    covariance: Float[np.ndarray, " e"]
+    log_determinant: float
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Gaussian posterior of the weights, and the evidence bound after every iteration."""
+    """Gaussian posterior of every class's weights, and the bound after every iteration."""
 
-    mean: Float[np.ndarray, "m k"]
-    covariance: Float[np.ndarray, "e k"]
-    precision: Float[np.ndarray, "e k"]
-    log_determinant: Float[np.ndarray, " k"]
+    classes: tuple[Weights, ...]
     history: tuple[float, ...]
+
+    @cached_property
+    def mean(self) -> Float[np.ndarray, "m k"]:
+        """Means of all features, 0 where a class has no weight."""
+        out = np.zeros((self.classes[0].space.size, len(self.classes)))
+        for k, own in enumerate(self.classes):
+            out[own.members, k] = own.mean
+        return out
+
+
+def every_member(space: FeatureSpace, classes: int) -> Bool[np.ndarray, "k m"]:
+    """Return the members where each class has all features."""
+    return np.ones((classes, space.size), dtype=bool)
 
 
 def diagonal_prior(
-    space: FeatureSpace, mean: Float[np.ndarray, "m k"], variance: Float[np.ndarray, " m"]
-) -> WeightPrior:
-    """Return independent weights with the given means, and variances shared by the classes."""
-    classes = mean.shape[1]
-    precision = np.zeros((space.envelope_size, classes))
-    precision[space.diagonal] = (1.0 / variance)[:, None]
-    return WeightPrior(mean, precision, np.full(classes, -np.log(variance).sum()))
+    space: FeatureSpace,
+    mean: Float[np.ndarray, "m k"],
+    variance: Float[np.ndarray, " m"],
+    members: Bool[np.ndarray, "k m"] | None = None,
+) -> tuple[Weights, ...]:
+    """Return independent weights with the given means, and variances shared by the classes.
+
+    `members` says which features each class has: all, if it is not given.
+    """
+    found = []
+    for k, held in enumerate(every_member(space, mean.shape[1]) if members is None else members):
+        index = np.flatnonzero(held)
+        own = space.part(index)
+        precision, covariance = np.zeros((2, own.envelope_size))
+        precision[own.diagonal], covariance[own.diagonal] = 1.0 / variance[index], variance[index]
+        determinant = -float(np.log(variance[index]).sum())
+        found.append(Weights(index, own, mean[index, k], precision, covariance, determinant))
+    return tuple(found)
 
 
 def bouchard_lambda(xi: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -97,19 +131,15 @@ def expected_bound(
     return float((own - alpha - terms.sum(axis=1)).sum())
 
 
-def divergence(space: FeatureSpace, posterior: Posterior, prior: WeightPrior) -> float:
-    """Sum over classes of the Kullback-Leibler divergence of the posterior from the prior."""
-    classes = prior.mean.shape[1]
-    trace = np.empty(classes)
-    kernels.envelope_inner(
-        prior.precision, posterior.covariance, space.row_first, space.base, trace
-    )
+def divergence(posterior: Weights, prior: Weights) -> float:
+    """Kullback-Leibler divergence of the posterior from the prior."""
+    rows = prior.space.row_first, prior.space.base
+    trace = kernels.envelope_inner(prior.precision, posterior.covariance, *rows)
     difference = posterior.mean - prior.mean
     product = np.empty_like(difference)
-    kernels.envelope_product(prior.precision, space.row_first, space.base, difference, product)
-    quadratic = (difference * product).sum(axis=0)
+    kernels.envelope_product(prior.precision, *rows, difference, product)
     gap = posterior.log_determinant - prior.log_determinant
-    return float(0.5 * (trace + quadratic - space.size + gap).sum())
+    return float(0.5 * (trace + difference @ product - prior.space.size + gap))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,56 +170,85 @@ def _row_pieces(space: FeatureSpace, features: BlockFeatures) -> list[tuple[int,
     return list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
 
 
-def _accumulate(
-    space: FeatureSpace,
-    features: BlockFeatures,
+def _maximised(
+    prior: Sequence[Weights],
+    features: Sequence[BlockFeatures],
     weight: Float[np.ndarray, "n k"],
-    out: Float[np.ndarray, "e k"],
-) -> None:
-    """Add sum_i weight_ik phi_i phi_i^T to `out`."""
-    pieces = _row_pieces(space, features)
+    linear: Float[np.ndarray, "n k"],
+) -> list[Weights]:
+    """Return the posteriors whose precision is the prior's and sum_i weight_ik phi_i phi_i^T."""
+    precisions = [own.precision.copy() for own in prior]
+    columns = np.ascontiguousarray(weight.T)
+    pieces = [
+        (k, *rows)
+        for k, own in enumerate(prior)
+        for rows in _row_pieces(own.space, features[k])
+    ]  # fmt: skip
 
     def rows(chunk: slice) -> None:
-        for lo, hi in pieces[chunk]:
-            kernels.gram_rows(*features.arguments, weight, space.row_first, space.base, lo, hi, out)
+        for k, lo, hi in pieces[chunk]:
+            space = prior[k].space
+            kernels.gram_rows(
+                *features[k].arguments, columns[k], space.row_first, space.base, lo, hi,
+                precisions[k],
+            )  # fmt: skip
 
     run_chunked(rows, len(pieces), 1)
+    information = np.ascontiguousarray(linear.T)
+    found: list[Weights | None] = [None] * len(prior)
+
+    def invert(k: int) -> None:
+        own = prior[k]
+        vector, sums = np.empty_like(own.mean), np.zeros_like(own.mean)
+        kernels.envelope_product(
+            own.precision, own.space.row_first, own.space.base, own.mean, vector
+        )
+        kernels.feature_sums(*features[k].arguments, information[k], sums)
+        mean, covariance, log_determinant = inverse(own.space, precisions[k], vector + sums)
+        found[k] = Weights(own.members, own.space, mean, precisions[k], covariance, log_determinant)
+
+    run_per_class(invert, len(prior))
+    return [own for own in found if own is not None]
 
 
 def logit_moments(
-    space: FeatureSpace,
-    features: BlockFeatures,
-    mean: Float[np.ndarray, "m k"],
-    covariance: Float[np.ndarray, "e k"],
+    classes: Sequence[Weights], features: Sequence[BlockFeatures]
 ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
     """Return mean and variance of every training point's logits, in block order."""
-    n, classes = len(features.order), mean.shape[1]
-    m, v = np.empty((n, classes)), np.empty((n, classes))
+    shape = len(features[0].order), len(classes)
+    m, v = np.empty(shape), np.empty(shape)
+    blocks = len(features[0].block_start) - 1
+    pieces = [(k, lo) for k in range(len(classes)) for lo in range(0, blocks, 256)]
 
-    def blocks(chunk: slice) -> None:
-        kernels.stored_moments(
-            *features.arguments, chunk.start, chunk.stop,
-            mean, covariance, space.row_first, space.base, m, v,
-        )  # fmt: skip
+    def work(chunk: slice) -> None:
+        for k, lo in pieces[chunk]:
+            own = classes[k]
+            kernels.stored_moments(
+                *features[k].arguments, lo, min(lo + 256, blocks), own.mean, own.covariance,
+                own.space.row_first, own.space.base, k, m, v,
+            )  # fmt: skip
 
-    run_chunked(blocks, len(features.block_start) - 1, 256)
+    run_chunked(work, len(pieces), 1)
     return m, v
 
 
 def fit_weights(
-    space: FeatureSpace,
     features: BlockFeatures,
     labels: Int[np.ndarray, " n"],
-    prior: WeightPrior,
+    prior: Sequence[Weights],
     *,
     iterations: int,
     variational_updates: int = 1,
     tolerance: float = 0.0,
     relaxation: float = 1.0,
+    start_variance: float = 1.0,
     offset: Float[np.ndarray, "n k"] | None = None,
 ) -> Posterior:
     """Run EM from xi = 1, alpha = 0 and return the posterior of all classes.
 
+    Around an `offset` it starts from what fits logits of that mean and of `start_variance`.
+
+    `features` are those of the map, of which the classes have what their prior says.
     `labels` (class per point, 0 is empty) and `offset` (what is added to every point's
     logits) follow the points as given, not the blocks.
     Stops after `iterations`, or when the bound rises by less than `tolerance` of itself.
@@ -203,87 +262,108 @@ def fit_weights(
     Raises:
         MapError: a label is not a class, or a precision matrix cannot be factorised.
     """
-    classes = prior.mean.shape[1]
+    classes = len(prior)
     labels = np.asarray(labels)[features.order]
     if len(labels) == 0 or labels.min() < 0 or labels.max() >= classes:
         raise MapError(f"labels must be classes 0..{classes - 1}, with at least one point")
     one_hot = np.zeros((len(labels), classes))
     one_hot[np.arange(len(labels)), labels] = 1.0
-    prior_information = np.empty_like(prior.mean)
-    kernels.envelope_product(
-        prior.precision, space.row_first, space.base, prior.mean, prior_information
-    )
+    own_features = [features.part(own.members) for own in prior]
+    guessed = offset is not None
     offset = np.zeros((1, classes)) if offset is None else offset[features.order]
-    used = _Variational(np.zeros(len(labels)), np.ones((len(labels), classes)))
-    plain, relaxed = used, False
-    history: list[float] = []
-    posterior: Posterior | None = None
-    for _ in range(iterations):
-        weight = bouchard_lambda(used.xi)
-        precision = prior.precision.copy()
-        _accumulate(space, features, 2.0 * weight, precision)
-        information = prior_information.copy()
-        linear = one_hot - 0.5 + 2.0 * (used.alpha[:, None] - offset) * weight
-        kernels.feature_sums(*features.arguments, linear, information)
-        mean, covariance = np.empty_like(prior.mean), np.empty_like(prior.precision)
-        log_determinant = invert_classes(space, precision, information, mean, covariance)
-        found = Posterior(mean, covariance, precision, log_determinant, ())
-        m, v = logit_moments(space, features, mean, covariance)
-        m += offset
+
+    def climbed(
+        m: Float[np.ndarray, "n k"], v: Float[np.ndarray, "n k"], start: Float[np.ndarray, "n k"]
+    ) -> _Variational:
+        """Return alpha and xi that raise the bound of logits with these moments."""
+        weight = bouchard_lambda(start)
         for _ in range(variational_updates):
             alpha = update_alpha(m, weight)
             xi = update_xi(m, v, alpha)
             weight = bouchard_lambda(xi)
-        bound = expected_bound(m, v, alpha, xi, labels) - divergence(space, found, prior)
+        return _Variational(alpha, xi)
+
+    used = _Variational(np.zeros(len(labels)), np.ones((len(labels), classes)))
+    if guessed:
+        used = climbed(offset, np.full_like(offset, start_variance), used.xi)
+    plain, relaxed = used, False
+    history: list[float] = []
+    best: list[Weights] = []
+    for _ in range(iterations):
+        weight = bouchard_lambda(used.xi)
+        linear = one_hot - 0.5 + 2.0 * (used.alpha[:, None] - offset) * weight
+        found = _maximised(prior, own_features, 2.0 * weight, linear)
+        m, v = logit_moments(found, own_features)
+        m += offset
+        step = climbed(m, v, used.xi)
+        bound = expected_bound(m, v, step.alpha, step.xi, labels)
+        bound -= sum(map(divergence, found, prior))
         if not np.isfinite(bound):
             raise MapError("the evidence bound is not finite; lower the prior variance")
         if relaxed and bound < history[-1]:
             used, relaxed = plain, False
             continue
-        posterior, plain = found, _Variational(alpha, xi)
+        best, plain = found, step
         used, relaxed = used.towards(plain, relaxation), relaxation > 1.0
         history.append(bound)
         if len(history) > 1 and history[-1] - history[-2] <= tolerance * abs(history[-2]):
             break
-    assert posterior is not None
-    return Posterior(
-        posterior.mean, posterior.covariance, posterior.precision,
-        posterior.log_determinant, tuple(history),
-    )  # fmt: skip
+    return Posterior(tuple(best), tuple(history))
 
 
-def empty_logit(occupancy: float, classes: int, variance: float) -> float:
+def empty_logit(occupancy: float, classes: int, variance: float, elsewhere: int = 0) -> float:
     """Mean logit of the empty class for which a flat posterior says P(occupied) = occupancy.
 
-    All other logits have mean 0, all have the given variance. With C = K - 1 objects and
-    t = exp(m / sqrt(1 + pi/4 variance)) the approximation gives q_0 = t / (C + t) and
-    q_k = 1 / (C + t) for each object, so P(empty) / P(occupied) = t / C: solved for m.
+    All other logits have mean 0, all have the given variance, but for `elsewhere` objects,
+    which have none. With C = K - 1 objects, none of them elsewhere, and t = exp(m / sqrt(1 +
+    pi/4 variance)) the approximation gives q_0 = t / (C + t) and q_k = 1 / (C + t) for each
+    object, so P(empty) / P(occupied) = t / C: solved for m.
     """
-    objects = classes - 1
     odds = (1.0 - occupancy) / occupancy
-    return math.log(objects * odds) * math.sqrt(1.0 + math.pi / 4.0 * variance)
+    equal = math.log((classes - 1) * odds) * math.sqrt(1.0 + math.pi / 4.0 * variance)
+    if elsewhere == 0:
+        return equal
+    spread = torch.full((1, classes), variance, dtype=torch.float64)
+    spread[0, classes - elsewhere :] = 0.0
+
+    def excess(logit: float) -> float:
+        mean = torch.zeros_like(spread)
+        mean[0, 0] = logit
+        return float(occupied_probability(mean, spread)) - occupancy
+
+    return float(brentq(excess, -abs(equal) - 1.0, abs(equal) + 1.0))
 
 
-def prior_means(config: MapConfig, classes: int) -> tuple[float, float]:
+def prior_means(config: MapConfig, classes: int, elsewhere: int = 0) -> tuple[float, float]:
     """Prior mean of the empty class's hinge weights and of its bias weight.
 
     Out of the hinges' reach only the bias acts, inside the lattice the kernels add a
     variance: each gets the mean that makes its flat prediction `config.prior_occupancy`.
+    `elsewhere` objects have no hinges there.
     """
     if config.prior_occupancy is None:
         return 0.0, 0.0
     outside = empty_logit(config.prior_occupancy, classes, config.bias_variance)
     inside = empty_logit(
-        config.prior_occupancy, classes, config.bias_variance + config.logit_variance
+        config.prior_occupancy, classes, config.bias_variance + config.logit_variance, elsewhere
     )
     return (inside - outside) / config.mean_feature_sum, outside
 
 
-def weight_prior(space: FeatureSpace, config: MapConfig, classes: int) -> WeightPrior:
-    """Return the prior of all weights, (M, K), independent between features and classes."""
+def weight_prior(
+    space: FeatureSpace,
+    config: MapConfig,
+    classes: int,
+    members: Bool[np.ndarray, "k m"] | None = None,
+) -> tuple[Weights, ...]:
+    """Return the prior of all weights, independent between features and classes."""
+    members = every_member(space, classes) if members is None else members
+    elsewhere = (~members).sum(axis=0)
     mean = np.zeros((space.size, classes))
-    mean[:-1, 0], mean[-1, 0] = prior_means(config, classes)
-    return diagonal_prior(space, mean, weight_variances(space, config))
+    for count in np.unique(elsewhere):
+        mean[elsewhere == count, 0] = prior_means(config, classes, int(count))[0]
+    mean[-1, 0] = prior_means(config, classes)[1]
+    return diagonal_prior(space, mean, weight_variances(space, config), members)
 
 
 def weight_variances(space: FeatureSpace, config: MapConfig) -> Float[np.ndarray, " m"]:
@@ -313,26 +393,34 @@ def expand_prior(
     old_space: FeatureSpace,
     old: Posterior,
     space: FeatureSpace,
-    fresh: WeightPrior,
-) -> WeightPrior:
+    fresh: Sequence[Weights],
+) -> tuple[Weights, ...]:
     """Make the old posterior the prior of a larger feature space.
 
-    Hinges of `space` that the old one has keep their joint posterior; the others enter
-    independent, with `fresh`, a diagonal prior of all of `space`.
+    Weights that the old one has keep their joint posterior; the others enter independent,
+    with `fresh`, a diagonal prior of all of `space`.
     """
+    place = places(old_space, space)
+    found = []
+    for before, own in zip(old.classes, fresh, strict=True):
+        target = np.searchsorted(own.members, place[before.members])
+        rows, columns = before.space.pairs.T
+        high = np.maximum(target[rows], target[columns])
+        low = np.minimum(target[rows], target[columns])
+        mean, precision = own.mean.copy(), own.precision.copy()
+        covariance = own.covariance.copy()
+        added = np.ones(len(mean), dtype=bool)
+        added[target] = False
+        gained = np.log(own.precision[own.space.diagonal][added]).sum()
+        mean[target] = before.mean
+        entries, kept = own.space.base[high] + low, before.space.base[rows] + columns
+        precision[entries], covariance[entries] = before.precision[kept], before.covariance[kept]
+        determinant = before.log_determinant + float(gained)
+        found.append(Weights(own.members, own.space, mean, precision, covariance, determinant))
+    return tuple(found)
+
+
+def places(old: FeatureSpace, space: FeatureSpace) -> Int64[np.ndarray, " m"]:
+    """Return where each feature of a space is in a larger one."""
     position = {row.tobytes(): i for i, row in enumerate(space.hinges)}
-    kept = [position[row.tobytes()] for row in old_space.hinges]
-    target = np.array([*kept, space.size - 1], dtype=np.int64)
-    rows = np.repeat(np.arange(old_space.size), np.arange(old_space.size) - old_space.row_first + 1)
-    columns = np.arange(old_space.envelope_size) - old_space.base[rows]
-    high = np.maximum(target[rows], target[columns])
-    low = np.minimum(target[rows], target[columns])
-    # What the new envelope leaves out are pairs too far apart to share a point: exact zeros.
-    stored = low >= space.row_first[high]
-    mean, precision = fresh.mean.copy(), fresh.precision.copy()
-    mean[target] = old.mean
-    precision[space.base[high[stored]] + low[stored]] = old.precision[stored]
-    added = np.ones(space.size, dtype=bool)
-    added[target] = False
-    gained = np.log(fresh.precision[space.diagonal][added]).sum(axis=0)
-    return WeightPrior(mean, precision, old.log_determinant + gained)
+    return np.array([*(position[row.tobytes()] for row in old.hinges), space.size - 1])

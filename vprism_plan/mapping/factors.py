@@ -19,14 +19,12 @@ import torch
 from jaxtyping import Float
 
 from vprism_plan._kernels import mapping as kernels
-from vprism_plan._threads import run_chunked, worker_count
+from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.features import FeatureSpace
 
 _BLOCK = 128  # hinges per block column: wide enough for fast products, narrow for the envelope
-_NOT_POSITIVE = (
-    "the posterior precision of class {} is not positive definite; lower the prior variance"
-)
+_NOT_POSITIVE = "a posterior precision is not positive definite; lower the prior variance"
 
 
 def run_per_class(work: Callable[[int], None], classes: int) -> None:
@@ -44,17 +42,11 @@ def run_per_class(work: Callable[[int], None], classes: int) -> None:
         torch.set_num_threads(before)
 
 
-def dense_class(
-    space: FeatureSpace, data: Float[np.ndarray, "e k"], k: int
-) -> Float[np.ndarray, "m m"]:
-    """Return class k's symmetric matrix, dense; zeros outside the envelope."""
+def dense(space: FeatureSpace, data: Float[np.ndarray, " e"]) -> Float[np.ndarray, "m m"]:
+    """Return a symmetric matrix, dense; zeros outside the envelope."""
     out = np.zeros((space.size, space.size))
-    kernels.unpack(data, k, space.row_first, space.base, out)
+    kernels.unpack(data, space.row_first, space.base, out)
     return out
-
-
-def _cholesky(space: FeatureSpace, precision: Float[np.ndarray, "e k"], k: int) -> torch.Tensor:
-    return _factor_block(torch.from_numpy(dense_class(space, precision, k)), k)
 
 
 def _block_columns(space: FeatureSpace) -> list[tuple[int, int, int]]:
@@ -73,19 +65,18 @@ def _block_columns(space: FeatureSpace) -> list[tuple[int, int, int]]:
     return columns
 
 
-def _invert_in_place(
-    matrix: torch.Tensor, vector: torch.Tensor, columns: list[tuple[int, int, int]], k: int
-) -> float:
-    """Replace a matrix by its inverse inside the envelope, and b by the solution of A x = b.
+def _factor_in_place(matrix: torch.Tensor, columns: list[tuple[int, int, int]]) -> float:
+    """Replace a matrix by its Cholesky factor inside the envelope; return the log determinant.
 
-    Both triangles are given and returned; entries outside the envelope end as garbage.
-    Returns the log determinant.
+    Both triangles are given; of the result only the lower one counts.
     """
     log_determinant = 0.0
     bias = matrix.shape[0] - 1
     for start, stop, reach in columns:
         own, below = slice(start, stop), slice(stop, reach)
-        diagonal = _factor_block(matrix[own, own], k)
+        diagonal, info = torch.linalg.cholesky_ex(matrix[own, own])
+        if int(info) != 0:
+            raise MapError(_NOT_POSITIVE)
         matrix[own, own] = diagonal
         log_determinant += 2.0 * float(torch.log(torch.diagonal(diagonal)).sum())
         panel = torch.cat([matrix[below, own], matrix[bias:, own]])
@@ -93,24 +84,47 @@ def _invert_in_place(
         under, arrow = panel[:-1], panel[-1]
         matrix[below, own], matrix[bias, own] = under, arrow
         matrix[below, below].addmm_(under, under.T, alpha=-1.0)
-        matrix[below, bias] -= under @ arrow
-        matrix[bias, below] = matrix[below, bias]
+        matrix[bias, below] -= under @ arrow
         matrix[bias, bias] -= arrow @ arrow
-        solved = torch.linalg.solve_triangular(diagonal, vector[own, None], upper=False)[:, 0]
-        vector[own] = solved
-        vector[below] -= under @ solved
-        vector[bias] -= arrow @ solved
     pivot = float(matrix[bias, bias])
     if not pivot > 0.0:
-        raise MapError(_NOT_POSITIVE.format(k))
-    matrix[bias, bias] = 1.0 / pivot
-    vector[bias] /= pivot
+        raise MapError(_NOT_POSITIVE)
+    matrix[bias, bias] = pivot**0.5
+    return log_determinant + float(np.log(pivot))
+
+
+def _solve_in_place(
+    factor: torch.Tensor, vectors: torch.Tensor, columns: list[tuple[int, int, int]], halves: int
+) -> None:
+    """Replace b by the solution of L^T x = b (halves = 1), or of L L^T x = b (halves = 2)."""
+    bias = factor.shape[0] - 1
+    if halves == 2:
+        for start, stop, reach in columns:
+            own, below = slice(start, stop), slice(stop, reach)
+            solved = torch.linalg.solve_triangular(factor[own, own], vectors[own], upper=False)
+            vectors[own] = solved
+            vectors[below] -= factor[below, own] @ solved
+            vectors[bias:] -= factor[bias:, own] @ solved
+        vectors[bias] /= factor[bias, bias]
+    vectors[bias] /= factor[bias, bias]
     for start, stop, reach in reversed(columns):
         own, below = slice(start, stop), slice(stop, reach)
-        diagonal, under, arrow = matrix[own, own].clone(), matrix[below, own], matrix[bias, own]
-        rest = vector[own] - under.T @ vector[below] - arrow * vector[bias]
-        vector[own] = torch.linalg.solve_triangular(diagonal.T, rest[:, None], upper=True)[:, 0]
-        panel = torch.cat([under, arrow[None]])
+        rest = vectors[own] - factor[below, own].T @ vectors[below]
+        rest -= factor[bias:, own].T @ vectors[bias:]
+        vectors[own] = torch.linalg.solve_triangular(factor[own, own].T, rest, upper=True)
+
+
+def _invert_in_place(matrix: torch.Tensor, columns: list[tuple[int, int, int]]) -> None:
+    """Replace a Cholesky factor by the inverse inside the envelope, both triangles.
+
+    Entries outside the envelope end as garbage.
+    """
+    bias = matrix.shape[0] - 1
+    matrix[bias, bias] = matrix[bias, bias] ** -2
+    for start, stop, reach in reversed(columns):
+        own, below = slice(start, stop), slice(stop, reach)
+        diagonal = matrix[own, own].clone()
+        panel = torch.cat([matrix[below, own], matrix[bias:, own]])
         panel = torch.linalg.solve_triangular(diagonal, panel, upper=False, left=False)
         under, arrow = panel[:-1], panel[-1:]
         # Z_Rj = -Z_RR X, Z_jj = (L L^T)^-1 - X^T Z_Rj, with the bias as one more row of R.
@@ -122,67 +136,34 @@ def _invert_in_place(
         matrix[own, own] = 0.5 * (block + block.T)
         matrix[below, own], matrix[own, below] = inverse, inverse.T
         matrix[bias, own] = matrix[own, bias] = to_bias[0]
-    return log_determinant + float(np.log(pivot))
 
 
-def _factor_block(block: torch.Tensor, k: int) -> torch.Tensor:
-    factor, info = torch.linalg.cholesky_ex(block)
-    if int(info) != 0:
-        raise MapError(_NOT_POSITIVE.format(k))
-    return factor
-
-
-def invert_classes(
-    space: FeatureSpace,
-    precision: Float[np.ndarray, "e k"],
-    information: Float[np.ndarray, "m k"],
-    mean: Float[np.ndarray, "m k"],
-    covariance: Float[np.ndarray, "e k"],
-) -> Float[np.ndarray, " k"]:
-    """Fill `mean` and `covariance` from precision and information (precision times mean).
-
-    Returns the log determinants of the precision. Holds one dense inverse per worker.
-    """
-    classes = mean.shape[1]
-    log_determinant = np.empty(classes)
+def inverse(
+    space: FeatureSpace, precision: Float[np.ndarray, " e"], information: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " e"], float]:
+    """Return mean, covariance and log determinant of a precision; information is precision times
+    mean."""
     columns = _block_columns(space)
-    # Inverses are packed a group of classes at a time: entries of one envelope position
-    # are neighbours in memory, and threads must not write into the same cache lines.
-    group = max(1, min(classes, worker_count(), 8))
-    inverses = np.empty((group, space.size, space.size))
-    for start in range(0, classes, group):
-        count = min(classes, start + group) - start
-
-        def work(index: int, start: int = start) -> None:
-            k = start + index
-            inverses[index] = 0.0
-            kernels.unpack(precision, k, space.row_first, space.base, inverses[index])
-            matrix = torch.from_numpy(inverses[index])
-            vector = torch.from_numpy(information[:, k].copy())
-            log_determinant[k] = _invert_in_place(matrix, vector, columns, k)
-            mean[:, k] = vector.numpy()
-
-        run_per_class(work, count)
-        kernels.pack(inverses[:count], start, space.row_first, space.base, covariance)
-    return log_determinant
+    matrix = torch.from_numpy(dense(space, precision))
+    log_determinant = _factor_in_place(matrix, columns)
+    mean = torch.from_numpy(information.copy())
+    _solve_in_place(matrix, mean[:, None], columns, 2)
+    _invert_in_place(matrix, columns)
+    covariance = np.empty_like(precision)
+    kernels.pack(matrix.numpy(), space.row_first, space.base, covariance)
+    return mean.numpy(), covariance, log_determinant
 
 
 def correlate(
-    space: FeatureSpace,
-    precision: Float[np.ndarray, "e k"],
-    k: int,
-    noise: Float[np.ndarray, "m n"],
+    space: FeatureSpace, precision: Float[np.ndarray, " e"], noise: Float[np.ndarray, "m n"]
 ) -> Float[np.ndarray, "m n"]:
-    """Turn white noise into draws with class k's posterior covariance (and mean 0).
+    """Turn white noise into draws with the covariance that belongs to a precision (and mean 0).
 
     The precision is L L^T, so L^-T noise has the covariance (L L^T)^-1.
     """
-    out = np.empty_like(noise)
-
-    def work(_: int) -> None:
-        factor = _cholesky(space, precision, k)
-        solution = torch.linalg.solve_triangular(factor.T, torch.from_numpy(noise), upper=True)
-        out[:] = solution.numpy()
-
-    run_per_class(work, 1)
-    return out
+    columns = _block_columns(space)
+    factor = torch.from_numpy(dense(space, precision))
+    _factor_in_place(factor, columns)
+    draws = torch.from_numpy(noise.copy())
+    _solve_in_place(factor, draws, columns, 1)
+    return draws.numpy()

@@ -42,18 +42,31 @@ class FeatureSpace:
         """Number of features M, bias included."""
         return len(self.hinges) + 1
 
+    def part(self, members: Int64[np.ndarray, " m"]) -> "FeatureSpace":
+        """Return the space of some of the features, in their order; the bias is the last."""
+        if len(members) == self.size:
+            return self
+        return FeatureSpace(self.hinges[members[:-1]], self.gamma, self.radius)
+
+    @cached_property
+    def pairs(self) -> Int64[np.ndarray, "p 2"]:
+        """Rows and columns of the lower triangle in which any Gram matrix is not 0, in order."""
+        every = np.arange(self.size)
+        found = [np.column_stack([every, every]), np.column_stack([every * 0 + every[-1], every])]
+        if len(self.hinges):
+            # The slack covers hinges exactly two radii apart, up to rounding.
+            near = cKDTree(self.hinges).query_pairs(
+                2.0 * self.radius * (1.0 + 1e-9), output_type="ndarray"
+            )
+            found.append(np.sort(near, axis=1)[:, ::-1])
+        key = np.unique(np.concatenate(found).astype(np.int64) @ [self.size, 1])
+        return np.column_stack([key // self.size, key % self.size])
+
     @cached_property
     def row_first(self) -> Int64[np.ndarray, " m"]:
         """First column of each envelope row."""
-        first = np.arange(self.size)
-        if len(self.hinges):
-            # The slack covers hinges exactly two radii apart, up to rounding.
-            pairs = cKDTree(self.hinges).query_pairs(
-                2.0 * self.radius * (1.0 + 1e-9), output_type="ndarray"
-            )
-            np.minimum.at(first, pairs.max(axis=1), pairs.min(axis=1))
-        first[-1] = 0
-        return first.astype(np.int64)
+        rows, columns = self.pairs.T
+        return columns[np.searchsorted(rows, np.arange(self.size))].copy()
 
     @cached_property
     def base(self) -> Int64[np.ndarray, " m"]:
@@ -140,6 +153,18 @@ class BlockFeatures:
     near_start: Int64[np.ndarray, " b1"]
     near: Int64[np.ndarray, " e"]
     phi: Float[np.ndarray, "e p"]
+
+    def part(self, members: Int64[np.ndarray, " m"]) -> "BlockFeatures":
+        """Return some of the features, in their order, of all points."""
+        size = int(members[-1]) + 1
+        if len(members) == size:
+            return self
+        place = np.full(size, -1)
+        place[members] = np.arange(len(members))
+        near = place[self.near]
+        kept = near >= 0
+        near_start = np.concatenate(([0], np.cumsum(kept)))[self.near_start]
+        return BlockFeatures(self.order, self.block_start, near_start, near[kept], self.phi[kept])
 
     @property
     def arguments(self) -> tuple[Any, Any, Any, Any]:

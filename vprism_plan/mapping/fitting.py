@@ -14,15 +14,16 @@ from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import (
     Posterior,
-    WeightPrior,
+    Weights,
     correction_variances,
     diagonal_prior,
     expand_prior,
     fit_weights,
+    places,
     weight_prior,
 )
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
-from vprism_plan.mapping.hinges import lattice_hinges, needed_nodes, surface_hinges
+from vprism_plan.mapping.hinges import lattice_hinges, local_features, needed_nodes, surface_hinges
 from vprism_plan.mapping.posterior import VPrismMap
 from vprism_plan.mapping.prior import (
     FLAT_OCCUPANCY,
@@ -108,7 +109,8 @@ def _fit(
     """`fit_map`; `known` are warnings of an earlier map of some of the views."""
     problem = learning_problem(observations, config, seed)
     views, ids, plane, space = problem.views, problem.object_ids, problem.plane, problem.space
-    weights, field = weight_prior(space, config, len(ids) + 1), None
+    members, field = problem.members, None
+    weights = weight_prior(space, config, len(ids) + 1, members)
     if prior is not None and config.prior_hidden_variance is not None:
 
         def under_table(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -125,7 +127,8 @@ def _fit(
         )
         depth = hidden_depth(space.hinges, views)
         variance = correction_variances(space, config, depth)
-        weights = diagonal_prior(space, np.zeros_like(weights.mean), variance)
+        mean = np.zeros((space.size, len(ids) + 1))
+        weights = diagonal_prior(space, mean, variance, members)
     posterior = _learn(space, problem.data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
@@ -159,6 +162,7 @@ class LearningProblem:
         plane: support surface, world frame.
         data: labelled points.
         space: hinge points and kernel.
+        members: which features each class has.
         warnings: what was odd about the views.
     """
 
@@ -167,6 +171,7 @@ class LearningProblem:
     plane: Plane
     data: TrainingData
     space: FeatureSpace
+    members: Bool[np.ndarray, "k m"]
     warnings: tuple[str, ...]
 
 
@@ -192,7 +197,8 @@ def learning_problem(
         config.cutoff_radius,
     )
     warnings = (*warnings, *_without_return(views, object_ids))
-    return LearningProblem(views, object_ids, plane, data, space, warnings)
+    members = local_features(space.hinges, data.lower, data.upper, config.class_reach)
+    return LearningProblem(views, object_ids, plane, data, space, members, warnings)
 
 
 def _views(observations: Any) -> tuple[Observation, ...]:
@@ -238,9 +244,14 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     hinges = np.concatenate([old.space.hinges, added])
     _check_hinge_count(len(hinges), data, config)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
-    fresh = weight_prior(space, config, old.n_classes)
-    weights = expand_prior(old.space, old.posterior, space, fresh)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
+    members = np.zeros((old.n_classes, space.size), dtype=bool)
+    members[class_of] = local_features(space.hinges, data.lower, data.upper, config.class_reach)
+    place = places(old.space, space)
+    for own, before in zip(members, old.posterior.classes, strict=True):
+        own[place[before.members]] = True
+    fresh = weight_prior(space, config, old.n_classes, members)
+    weights = expand_prior(old.space, old.posterior, space, fresh)
     data = TrainingData(
         data.points, class_of[data.classes], data.lower, data.upper, data.surface,
         data.surface_ids, data.sunk,
@@ -358,19 +369,20 @@ def new_hinges(
 
 
 def _learn(
-    space: FeatureSpace, data: TrainingData, weights: WeightPrior, config: MapConfig,
+    space: FeatureSpace, data: TrainingData, weights: tuple[Weights, ...], config: MapConfig,
     field: PriorField | None,
 ) -> Posterior:  # fmt: skip
     features = block_features(space, data.points)
     logger.info(
         "fitting %d points, %d hinge points, %d classes",
-        len(data.points), len(space.hinges), weights.mean.shape[1],
+        len(data.points), len(space.hinges), len(weights),
     )  # fmt: skip
     return fit_weights(
-        space, features, data.classes, weights,
+        features, data.classes, weights,
         iterations=config.iterations,
         variational_updates=config.variational_updates,
         relaxation=config.relaxation,
+        start_variance=config.start_variance,
         tolerance=config.tolerance,
         offset=None if field is None else field.at(data.points),
     )  # fmt: skip

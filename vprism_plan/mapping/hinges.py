@@ -73,6 +73,27 @@ def surface_hinges(
     return np.concatenate(chosen)
 
 
+def local_features(
+    hinges: Float[np.ndarray, "h 3"],
+    lower: Float[np.ndarray, "c 3"],
+    upper: Float[np.ndarray, "c 3"],
+    reach: float | None,
+) -> Bool[np.ndarray, "k m"]:
+    """Return which features each class has: "empty" all, an object those that reach where it is.
+
+    Args:
+        hinges: m, world.
+        lower, upper: corners of the objects' boxes, m.
+        reach: an object has the hinges at most this far from its box, m; None: all.
+    """
+    members = np.ones((len(lower) + 1, len(hinges) + 1), dtype=bool)
+    if reach is not None:
+        for own, low, high in zip(members[1:, :-1], lower, upper, strict=True):
+            beyond = np.maximum(np.maximum(low - hinges, hinges - high), 0.0)
+            own[:] = np.linalg.norm(beyond, axis=1) <= reach
+    return members
+
+
 # Metres above the support surface up to which an unlabelled point may be of it: noise at table
 # range. What is lower than that casts no shadow that a lattice of centimetres could show.
 _ON_PLANE = 0.01

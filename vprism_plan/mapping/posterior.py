@@ -15,8 +15,8 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior
-from vprism_plan.mapping.factors import correlate, dense_class
+from vprism_plan.mapping.em import Posterior, Weights
+from vprism_plan.mapping.factors import correlate, dense, run_per_class
 from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
 from vprism_plan.mapping.prior import PriorField
 from vprism_plan.perception.observation import Observation
@@ -116,7 +116,7 @@ class VPrismMap:
     @cached_property
     def unsupported_occupancy(self) -> float:
         """P(occupied) where no hinge reaches, so that only the bias weights act."""
-        mean, variance = self.posterior.mean[-1].copy(), self.posterior.covariance[-1].copy()
+        mean, variance = self._bias_moments[0].copy(), self._bias_moments[1]
         if self.prior is not None:
             mean[1:] += float(self.prior.elsewhere.max())
         return float(
@@ -214,18 +214,23 @@ class VPrismMap:
     def sample_weights(self, n: int, seed: int) -> Float[np.ndarray, "n m k"]:
         """Draw n joint samples of all weights: (n, M, K), features in hinge order, bias last.
 
-        The logits of draw s at x are `phi(x) @ result[s]`, and those of `prior`. The same seed
-        gives the same draws. Classes are independent under the posterior, features are not.
+        The logits of draw s at x are `phi(x) @ result[s]`, and those of `prior`. Weights that a
+        class does not have are 0. The same seed gives the same draws. Classes are independent
+        under the posterior, features are not.
         """
         if n < 1:
             raise MapError(f"n is {n}; ask for at least 1 draw")
         rng = np.random.default_rng(seed)
-        size = self.space.size
-        out = np.empty((n, size, self.n_classes))
-        for k in range(self.n_classes):
-            noise = rng.standard_normal((size, n))
-            out[:, :, k] = correlate(self.space, self.posterior.precision, k, noise).T
-        return out + self.posterior.mean
+        out = np.zeros((n, self.space.size, self.n_classes))
+        noise = [rng.standard_normal((own.space.size, n)) for own in self.posterior.classes]
+
+        def draw(k: int) -> None:
+            own = self.posterior.classes[k]
+            drawn = correlate(own.space, own.precision, noise[k]) + own.mean[:, None]
+            out[:, own.members, k] = drawn.T
+
+        run_per_class(draw, self.n_classes)
+        return out
 
     # ------------------------------------------------------------------ learning, files
     def update(self, observation: Observation, prior: Any = "shape") -> "VPrismMap":
@@ -258,26 +263,38 @@ class VPrismMap:
         """Return logit mean, variance and kernel mass; threads over blocks of near points."""
         n = len(points)
         mean, variance = np.empty((n, self.n_classes)), np.empty((n, self.n_classes))
-        mean[:], variance[:] = self.posterior.mean[-1], self.posterior.covariance[-1]
-        support = np.zeros(n)
+        mean[:], variance[:] = self._bias_moments
+        support, unused = np.zeros(n), np.empty(n)
         lower, upper = self.space.bounds
         inside = np.flatnonzero(((points > lower) & (points < upper)).all(axis=1))
         if len(inside):
             order, block_start = make_blocks(points[inside], block_extent(self.space))
             order = inside[order]
-            space, posterior = self.space, self.posterior
+            for k, own in enumerate(self.posterior.classes):
+                space, mass = own.space, support if k == 0 else unused
 
-            def chunk(piece: slice) -> None:
-                kernels.point_moments(
-                    points, order, block_start, piece.start, piece.stop, *space.kernel_arguments,
-                    space.gamma, space.radius**2, posterior.mean, posterior.covariance,
-                    space.row_first, space.base, mean, variance, support,
-                )  # fmt: skip
+                def chunk(
+                    piece: slice, k: int = k, own: Weights = own,
+                    space: FeatureSpace = space, mass: np.ndarray = mass,
+                ) -> None:  # fmt: skip
+                    kernels.point_moments(
+                        points, order, block_start, piece.start, piece.stop,
+                        *space.kernel_arguments, space.gamma, space.radius**2,
+                        own.mean, own.covariance, space.row_first, space.base, k,
+                        mean, variance, mass,
+                    )  # fmt: skip
 
-            run_chunked(chunk, len(block_start) - 1, 64)
+                run_chunked(chunk, len(block_start) - 1, 64)
         if self.prior is not None:
             mean += self.prior.at(points)
         return mean, variance, support
+
+    @cached_property
+    def _bias_moments(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+        """Mean and variance of every logit where no hinge reaches."""
+        classes = self.posterior.classes
+        mean = np.array([own.mean[-1] for own in classes])
+        return mean, np.array([own.covariance[-1] for own in classes])
 
     def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
         return self._normalised(*self._moments(_checked_points(points))[:2])
@@ -304,9 +321,7 @@ class VPrismMap:
             return self._guessed(points, *self._dense_moments(points))
         if points.requires_grad and torch.is_grad_enabled():
             exact = points.to(torch.float64)
-            moments = prediction.LogitMoments.apply(
-                exact, self.space, self.posterior.mean, self.posterior.covariance
-            )
+            moments = prediction.LogitMoments.apply(exact, self.posterior.classes)
             return self._guessed(exact, *moments)
         array = np.ascontiguousarray(points.detach().to(torch.float64).numpy())
         mean, variance, support = self._moments(array)
@@ -333,15 +348,13 @@ class VPrismMap:
     ) -> tuple[Tensor, Tensor, Tensor]:
         cache = self.__dict__.setdefault("_arrays_on", {})
         if (device, dtype) not in cache:
-            dense = np.stack(
-                [
-                    dense_class(self.space, self.posterior.covariance, k)
-                    for k in range(self.n_classes)
-                ]
-            )
+            size = self.space.size
+            covariance = np.zeros((self.n_classes, size, size))
+            for matrix, own in zip(covariance, self.posterior.classes, strict=True):
+                matrix[np.ix_(own.members, own.members)] = dense(own.space, own.covariance)
             cache[device, dtype] = tuple(
                 torch.from_numpy(np.ascontiguousarray(a)).to(device, dtype)
-                for a in (self.space.hinges, self.posterior.mean, dense)
+                for a in (self.space.hinges, self.posterior.mean, covariance)
             )
         return cache[device, dtype]
 

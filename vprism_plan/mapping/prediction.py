@@ -8,7 +8,8 @@ which never cancels. For K > 2 the q_k do not sum to 1: they are normalised here
 """
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
@@ -16,7 +17,9 @@ from torch import Tensor
 
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
-from vprism_plan.mapping.features import FeatureSpace
+
+if TYPE_CHECKING:
+    from vprism_plan.mapping.em import Weights
 
 
 def log_scores(mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
@@ -79,25 +82,27 @@ class LogitMoments(torch.autograd.Function):
 
     @staticmethod
     def forward(  # noqa: D102
-        ctx: Any, points: Tensor, space: FeatureSpace, mean: Any, covariance: Any
+        ctx: Any, points: Tensor, classes: Sequence["Weights"]
     ) -> tuple[Tensor, Tensor, Tensor]:
         from vprism_plan._kernels import mapping as kernels
 
         x = points.detach().contiguous().numpy()
-        n, classes = len(x), mean.shape[1]
-        shapes = [(n, classes), (n, classes), (n,)]
-        outputs = [torch.empty(shape, dtype=torch.float64) for shape in shapes]
-        slopes = [torch.empty((*shape, 3), dtype=torch.float64) for shape in shapes]
+        shapes = [(len(x), len(classes)), (len(x), len(classes)), (len(x),)]
+        outputs = [torch.zeros(shape, dtype=torch.float64) for shape in shapes]
+        slopes = [torch.zeros((*shape, 3), dtype=torch.float64) for shape in shapes]
         m, v, s, m_slope, v_slope, s_slope = (t.numpy() for t in (*outputs, *slopes))
 
         def chunk(piece: slice) -> None:
-            kernels.point_jacobians(
-                x, piece.start, piece.stop, *space.kernel_arguments, space.gamma,
-                space.radius**2, mean, covariance, space.row_first, space.base,
-                m, v, s, m_slope, v_slope, s_slope,
-            )  # fmt: skip
+            # "Empty", which has all hinges, comes last: the mass of the kernels is that of its.
+            for k in reversed(range(len(classes))):
+                own, space = classes[k], classes[k].space
+                kernels.point_jacobians(
+                    x, piece.start, piece.stop, *space.kernel_arguments, space.gamma,
+                    space.radius**2, own.mean, own.covariance, space.row_first, space.base, k,
+                    m, v, s, m_slope, v_slope, s_slope,
+                )  # fmt: skip
 
-        run_chunked(chunk, n, 256)
+        run_chunked(chunk, len(x), 256)
         ctx.save_for_backward(points, *slopes)
         return outputs[0], outputs[1], outputs[2]
 
@@ -112,7 +117,7 @@ class LogitMoments(torch.autograd.Function):
         )
         if torch.is_grad_enabled():
             gradient = _NoSecondDerivative.apply(gradient, points)
-        return gradient, None, None, None
+        return gradient, None
 
 
 def dense_moments(

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Maps on disk: one safetensors file, JSON in its header, no pickle.
 
-The tensors are the posterior exactly as it is used, so a loaded map answers with the
-same bits. The header key "vprism_plan" holds version, configuration, object ids, seed,
-warnings, the number of views and the kernel's radius; "sha256" a digest of that and of all
-tensors. A file that is not what was written is refused: one bit of it can free a shadow.
+The tensors are what the posterior follows from: means, and those entries of the precisions
+that are not 0. Covariances are computed again, by the same steps on the same numbers, so a map
+answers with the same bits (on another processor the last ones may differ). The header key
+"vprism_plan" holds version, configuration, object ids, seed, warnings, the number of views and
+the kernel's radius; "sha256" a digest of that and of all tensors. A file that is not what was
+written is refused: one bit of it can free a shadow.
 """
 
 import hashlib
@@ -24,7 +26,8 @@ from vprism_plan._arguments import is_whole
 from vprism_plan._files import reading, replacing
 from vprism_plan.errors import ConfigError, MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior
+from vprism_plan.mapping.em import Posterior, Weights
+from vprism_plan.mapping.factors import inverse, run_per_class
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.prior import SIDE, PriorField
 from vprism_plan.perception.observation import Observation
@@ -33,7 +36,7 @@ from vprism_plan.perception.plane import Plane
 if TYPE_CHECKING:
     from vprism_plan.mapping.posterior import VPrismMap
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 _HEADER = "vprism_plan"
 _DIGEST = "sha256"
 _NEEDED_PARTS = ("depth", "labels", "intrinsics")
@@ -48,13 +51,14 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
     posterior = fitted.posterior
     tensors = {
         "hinges": fitted.space.hinges,
-        "mean": posterior.mean,
-        "covariance": posterior.covariance,
-        "precision": posterior.precision,
-        "log_determinant": posterior.log_determinant,
         "history": np.array(posterior.history),
         "plane": _plane_row(fitted.plane),
     }
+    for k, own in enumerate(posterior.classes):
+        rows, columns = own.space.pairs.T
+        tensors[f"class{k}.members"] = own.members.astype(np.int32)
+        tensors[f"class{k}.mean"] = own.mean
+        tensors[f"class{k}.precision"] = own.precision[own.space.base[rows] + columns]
     prior = fitted.prior
     if prior is not None:
         tensors |= {f"prior.{name}": getattr(prior, name) for name in _PRIOR}
@@ -143,13 +147,6 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     lengths = {name: tuple(meta["config"][name]) for name in ("hinge_shift", "prior_depths")}
     config = MapConfig(**{**meta["config"], **lengths})
     space = FeatureSpace(tensors["hinges"], config.gamma, float.fromhex(meta["radius"]))
-    posterior = Posterior(
-        tensors["mean"],
-        tensors["covariance"],
-        tensors["precision"],
-        tensors["log_determinant"],
-        tuple(tensors["history"].tolist()),
-    )
     object_ids = tuple(meta["object_ids"])
     if not all(is_whole(i) and i > 0 for i in object_ids) or tuple(sorted(set(object_ids))) != (
         object_ids
@@ -157,9 +154,9 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
         raise MapError(f"object ids are {object_ids}; they must be positive and rise")
     if not (is_whole(meta["seed"]) and meta["seed"] >= 0):
         raise MapError(f"seed is {meta['seed']!r}; it must be a whole number from 0")
-    _check_hinges(space, config, posterior)
-    _check_posterior(space, posterior, len(object_ids) + 1)
-    views = _views(tensors, meta["views"], meta["max_range"])
+    _check_hinges(space, config, len(tensors["class0.precision"]))
+    posterior = _posterior(tensors, space, len(object_ids) + 1)
+    views = _views(tensors, meta["views"], meta["max_range"], len(object_ids) + 1)
     _check_labels(views, object_ids)
     plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
     if not all(isinstance(text, str) for text in warnings):
@@ -192,8 +189,8 @@ def _prior(tensors: Mapping[str, np.ndarray], objects: int, own: Any) -> PriorFi
     return field
 
 
-def _check_hinges(space: FeatureSpace, config: MapConfig, posterior: Posterior) -> None:
-    """Refuse hinges that kernels cannot take, or whose pairs the covariances do not hold."""
+def _check_hinges(space: FeatureSpace, config: MapConfig, stored: int) -> None:
+    """Refuse hinges that kernels cannot take, or that make more pairs than are stored."""
     hinges = space.hinges
     if hinges.dtype != np.float64 or hinges.ndim != 2 or hinges.shape[1] != 3:
         raise MapError(f"hinges have shape {hinges.shape} and type {hinges.dtype}")
@@ -205,50 +202,64 @@ def _check_hinges(space: FeatureSpace, config: MapConfig, posterior: Posterior) 
         # Listing the pairs of hinges that are not these could take any amount of memory.
         tree = cKDTree(hinges)
         pairs = (int(tree.count_neighbors(tree, 2.0 * space.radius)) - len(hinges)) // 2
-        if pairs > len(posterior.covariance):
+        if pairs > stored:
             raise MapError(
-                f"{len(hinges)} hinges make {pairs} pairs, but there are "
-                f"{len(posterior.covariance)} covariances"
+                f"{len(hinges)} hinges make {pairs} pairs, but there are {stored} of them"
             )
 
 
-def _check_posterior(space: FeatureSpace, posterior: Posterior, classes: int) -> None:
-    expected = {
-        "mean": (space.size, classes),
-        "covariance": (space.envelope_size, classes),
-        "precision": (space.envelope_size, classes),
-        "log_determinant": (classes,),
-    }
-    for name, shape in expected.items():
-        array = getattr(posterior, name)
-        if array.shape != shape or array.dtype != np.float64 or not np.isfinite(array).all():
-            raise MapError(
-                f"{name} has shape {array.shape} and type {array.dtype}, or holds NaN; expected "
-                f"finite float64 {shape}"
-            )
-    variance = posterior.covariance[space.diagonal]
-    precision = posterior.precision[space.diagonal]
-    if not ((variance > 0.0).all() and (precision > 0.0).all()):
-        raise MapError("a variance or a precision is not positive")
-    # Of a positive definite matrix and its inverse, diagonals multiply to 1 at least, and
-    # no determinant exceeds the product of its diagonal (Hadamard).
-    bound = np.log(precision).sum(axis=0)
-    if (variance * precision < 1.0 - 1e-6).any() or (
-        posterior.log_determinant > bound + 1e-6 * (1.0 + np.abs(bound))
-    ).any():
-        raise MapError("covariance, precision and log_determinant are not of one posterior")
-    if np.ndim(posterior.history) != 1 or not np.isfinite(posterior.history).all():
+def _posterior(tensors: Mapping[str, np.ndarray], space: FeatureSpace, count: int) -> Posterior:
+    """Return the posterior, if its parts fit together."""
+    classes: list[Any] = [None] * count
+
+    def read(k: int) -> None:
+        classes[k] = _class(tensors, space, k)
+
+    run_per_class(read, count)  # as they were learned: the number of threads changes bits
+    if len(classes[0].members) != space.size:
+        raise MapError("class 0, empty, must have all features")
+    history = tensors["history"]
+    if np.ndim(history) != 1 or not np.isfinite(history).all():
         raise MapError("history is no row of finite numbers")
+    return Posterior(tuple(classes), tuple(history.tolist()))
 
 
-def _views(tensors: Mapping[str, np.ndarray], count: Any, ranges: Any) -> tuple[Observation, ...]:
+def _class(tensors: Mapping[str, np.ndarray], space: FeatureSpace, k: int) -> Weights:
+    members, mean, values = (
+        tensors[f"class{k}.{name}"] for name in ("members", "mean", "precision")
+    )
+    if members.dtype != np.int32 or members.ndim != 1 or members.size == 0:
+        raise MapError(f"class{k}.members have type {members.dtype}; they must be a row of int32")
+    members = members.astype(np.int64)
+    if members[0] < 0 or members[-1] != space.size - 1 or (np.diff(members) <= 0).any():
+        raise MapError(f"class{k}.members must rise from 0 at least to the bias, {space.size - 1}")
+    own = space.part(members)
+    for name, array, size in (("mean", mean, own.size), ("precision", values, len(own.pairs))):
+        if array.dtype != np.float64 or array.shape != (size,) or not np.isfinite(array).all():
+            raise MapError(
+                f"class{k}.{name} has shape {array.shape} and type {array.dtype}, or holds NaN; "
+                f"expected finite float64 {(size,)}"
+            )
+    rows, columns = own.pairs.T
+    precision = np.zeros(own.envelope_size)
+    precision[own.base[rows] + columns] = values
+    _, covariance, log_determinant = inverse(own, precision, mean)
+    if not (np.isfinite(covariance).all() and (covariance[own.diagonal] > 0.0).all()):
+        raise MapError(f"class{k}.precision has no inverse with positive variances")
+    return Weights(members, own, mean, precision, covariance, log_determinant)
+
+
+def _views(
+    tensors: Mapping[str, np.ndarray], count: Any, ranges: Any, classes: int
+) -> tuple[Observation, ...]:
     """Return all views; there is one at least, and no tensor belongs to nothing."""
     if not (is_whole(count) and 0 < count <= len(tensors)):
         raise MapError(f"views is {count!r}; a map is learned from one at least")
     if not (isinstance(ranges, list) and len(ranges) == count):
         raise MapError(f"max_range is {ranges!r}; it must be a list of one length per view")
-    names = {"hinges", "mean", "covariance", "precision", "log_determinant", "history", "plane"}
-    names |= {f"prior.{name}" for name in _PRIOR}
+    names = {"hinges", "history", "plane"} | {f"prior.{name}" for name in _PRIOR}
+    for k in range(classes):
+        names.update(f"class{k}.{name}" for name in ("members", "mean", "precision"))
     for index in range(count):
         names.update(f"view{index}.{part}" for part in (*_VIEW_PARTS, "plane"))
     stray = sorted(set(tensors) - names)
