@@ -39,7 +39,7 @@ def fit(
     problem = learning_problem(observation, config, seed)
     weights, history = descend(problem, seed, epochs)
     return VPrismMap(
-        config, problem.object_ids, problem.plane, problem.views, problem.space,
+        problem.config, problem.object_ids, problem.plane, problem.views, problem.space,
         _certain(problem.space, weights, history), seed,
     )  # fmt: skip
 

@@ -51,6 +51,7 @@ def fit(observation: Observation, seed: int, config: MapConfig | None = None) ->
     """
     config = MapConfig() if config is None else config
     problem = learning_problem(observation, config, seed)
+    config = problem.config
     if config.prior_occupancy is not None:
         share = 1.0 - (1.0 - config.prior_occupancy) ** (1.0 / len(problem.object_ids))
         config = replace(config, prior_occupancy=share)

@@ -8,7 +8,7 @@ import pytest
 
 from vprism_plan.errors import MapError, ObservationError, PlaneNotFoundError
 from vprism_plan.mapping import MapConfig, fit_map
-from vprism_plan.mapping.em import expand_prior, weight_prior
+from vprism_plan.mapping.em import Posterior, expand_prior, weight_prior
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.fitting import training_data
 from vprism_plan.mapping.posterior import VPrismMap
@@ -228,9 +228,80 @@ def test_several_views_need_poses(scene):
         fit_map([obs, unposed])
 
 
-def test_too_many_hinges_are_refused_before_the_work(scene):
-    with pytest.raises(MapError, match="hinge"):
-        fit_map(scene.observation, MapConfig(hinge_spacing=0.01))
+def test_a_scene_that_outgrows_the_budget_gets_a_coarser_lattice(scene, second_view):
+    asked = MapConfig(max_hinges=400)
+    fitted = fit_map(scene.observation, asked, prior=None)
+    used = fitted.config
+    assert 300 < len(fitted.space.hinges) <= 400
+    assert fitted.kernel_length == used.kernel_length > asked.kernel_length
+    # Spacing and kernel grow together: the prior of a logit stays what it was.
+    assert used.mean_squared_feature_sum == pytest.approx(asked.mean_squared_feature_sum)
+    assert used.hinge_spacing / asked.hinge_spacing == pytest.approx(
+        used.kernel_length / asked.kernel_length
+    )
+    (warning,) = [text for text in fitted.warnings if "max_hinges" in text]
+    assert f"{1e3 * used.hinge_spacing:.0f} mm apart instead of 28" in warning
+    assert iou(scene, fitted, grid_over(scene)) > 0.5
+    # New ground that does not fit beside the old: both views again, coarser.
+    tight = dataclasses.replace(used, max_hinges=len(fitted.space.hinges))
+    again = VPrismMap(
+        tight, fitted.object_ids, fitted.plane, fitted.views, fitted.space, fitted.posterior, 0
+    ).update(second_view)
+    assert len(again.views) == 2
+    assert len(again.space.hinges) <= tight.max_hinges
+
+
+def test_a_carton_is_no_error_and_a_house_is(scene):
+    """Lengths ten times too large are the usual mistake of units."""
+    obs, plane = scene.observation, Plane([0.0, 0.0, 1.0], 0.0)
+    pose = obs.pose.copy()
+    for factor, refused in ((5.0, False), (40.0, True)):
+        pose[:3, 3] = factor * obs.pose[:3, 3]
+        large = Observation(
+            factor * obs.depth, obs.labels, obs.intrinsics, pose, plane=plane, max_range=1e3
+        )
+        if refused:
+            with pytest.raises(MapError, match="max_hinges"):
+                fit_map(large, prior=None)
+        else:
+            assert "max_hinges" in fit_map(large, prior=None).warnings[-1]
+
+
+def test_the_empty_posterior_of_a_map_says_its_prior_everywhere(scene):
+    """Whether an object has hinges at a place or none, what nobody looked at is 0.2 occupied."""
+    config = MapConfig()
+    space = fit_map(scene.observation, prior=None).space
+    for count in (0, 1, 3):
+        members = np.zeros((5, space.size), dtype=bool)
+        members[: count + 1], members[:, -1] = True, True
+        classes = weight_prior(space, config, 5, members)
+        flat = VPrismMap(
+            config, (1, 2, 3, 4), Plane([0.0, 0.0, 1.0], 0.0), (), space, Posterior(classes, ()), 0
+        )
+        middle = space.hinges[flat.support(space.hinges) > 0.95 * config.mean_feature_sum]
+        points = middle + np.random.default_rng(0).uniform(-0.5, 0.5, middle.shape) * 0.028
+        assert flat.occupancy(points).mean() == pytest.approx(0.2, abs=0.03)
+
+
+def test_objects_are_local(scene, default_map):
+    """An object has the hinges near its box; elsewhere its logit is its prior's."""
+    reach, everywhere = default_map.config.class_reach, default_map.space
+    points, labels = scene.observation.points()
+    empty, *objects = default_map.posterior.classes
+    assert empty.space is everywhere
+    for k, own in enumerate(objects, start=1):
+        seen = points[labels == default_map.object_ids[k - 1]]
+        low, high = seen.min(0) - reach - 1e-9, seen.max(0) + reach + 1e-9
+        hinges = own.space.hinges
+        assert ((hinges > low) & (hinges < high)).all()
+        assert 0 < len(hinges) < len(everywhere.hinges)
+        far = everywhere.hinges[
+            np.linalg.norm(everywhere.hinges[:, None] - hinges, axis=2).min(1)
+            > default_map.cutoff_radius
+        ]
+        mean, variance = default_map.logit_moments(far)
+        np.testing.assert_array_equal(mean[:, k], own.mean[-1])
+        np.testing.assert_array_equal(variance[:, k], own.covariance[-1])
 
 
 def test_the_repr_is_short(small_map):

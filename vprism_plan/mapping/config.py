@@ -70,7 +70,9 @@ class MapConfig:
         surface_hinges: random surface points taken as hinges, per object. Where the
             lattice is coarse they add detail; where it is fine they add prior variance
             in random places, and lose accuracy.
-        max_hinges: refuse to build more (memory and time grow with the cube).
+        max_hinges: more are never built (memory and time grow with them faster than they
+            do). Where a scene needs more, spacing and kernel grow together until it does not,
+            and the map warns of it; its `config` holds what was used.
     Learning
         iterations: EM iterations at most.
         variational_updates: alternations of alpha and xi per iteration (the paper: 1).
@@ -116,7 +118,7 @@ class MapConfig:
     """
 
     gamma: float = 1500.0
-    kernel_cutoff: float = 1e-5
+    kernel_cutoff: float = 1e-4
     hinge_spacing: float = 0.028
     hinge_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     hinge_radius: float = 0.12
@@ -241,6 +243,7 @@ class MapConfig:
         """
         return cls(
             gamma=1000.0,
+            kernel_cutoff=1e-5,
             hinge_spacing=0.028,
             hinge_reach=None,
             iterations=10,

@@ -83,7 +83,11 @@ def _factor_in_place(matrix: torch.Tensor, columns: list[tuple[int, int, int]]) 
         panel = torch.linalg.solve_triangular(diagonal.T, panel, upper=True, left=False)
         under, arrow = panel[:-1], panel[-1]
         matrix[below, own], matrix[bias, own] = under, arrow
-        matrix[below, below].addmm_(under, under.T, alpha=-1.0)
+        for first in range(stop, reach, _BLOCK):  # the lower triangle only
+            rows, part = slice(first, reach), slice(first, min(first + _BLOCK, reach))
+            matrix[rows, part].addmm_(
+                under[first - stop :], under[first - stop : part.stop - stop].T, alpha=-1.0
+            )
         matrix[bias, below] -= under @ arrow
         matrix[bias, bias] -= arrow @ arrow
     pivot = float(matrix[bias, bias])

@@ -48,25 +48,32 @@ class FeatureSpace:
             return self
         return FeatureSpace(self.hinges[members[:-1]], self.gamma, self.radius)
 
-    @cached_property
+    def _near(self) -> Int64[np.ndarray, "p 2"]:
+        """Pairs of hinges that some point may see both of, the later one first."""
+        if len(self.hinges) == 0:
+            return np.zeros((0, 2), np.int64)
+        # The slack covers hinges exactly two radii apart, up to rounding.
+        reach = 2.0 * self.radius * (1.0 + 1e-9)
+        found = cKDTree(self.hinges).query_pairs(reach, output_type="ndarray")
+        return found[:, ::-1].astype(np.int64)  # scipy gives i < j
+
+    @property
     def pairs(self) -> Int64[np.ndarray, "p 2"]:
         """Rows and columns of the lower triangle in which any Gram matrix is not 0, in order."""
         every = np.arange(self.size)
-        found = [np.column_stack([every, every]), np.column_stack([every * 0 + every[-1], every])]
-        if len(self.hinges):
-            # The slack covers hinges exactly two radii apart, up to rounding.
-            near = cKDTree(self.hinges).query_pairs(
-                2.0 * self.radius * (1.0 + 1e-9), output_type="ndarray"
-            )
-            found.append(np.sort(near, axis=1)[:, ::-1])
-        key = np.unique(np.concatenate(found).astype(np.int64) @ [self.size, 1])
+        bias = np.column_stack([np.full(self.size - 1, self.size - 1), every[:-1]])
+        found = np.concatenate([self._near(), np.column_stack([every, every]), bias])
+        key = np.sort(found @ [self.size, 1])
         return np.column_stack([key // self.size, key % self.size])
 
     @cached_property
     def row_first(self) -> Int64[np.ndarray, " m"]:
         """First column of each envelope row."""
-        rows, columns = self.pairs.T
-        return columns[np.searchsorted(rows, np.arange(self.size))].copy()
+        first = np.arange(self.size)
+        rows, columns = self._near().T
+        np.minimum.at(first, rows, columns)
+        first[-1] = 0
+        return first
 
     @cached_property
     def base(self) -> Int64[np.ndarray, " m"]:

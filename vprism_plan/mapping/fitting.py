@@ -3,7 +3,7 @@
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ def fit_map(
     Raises:
         ObservationError: no labels or no objects (see `segment_tabletop`).
         PlaneNotFoundError: no support plane is known and none can be fitted.
-        MapError: the objects would need too many hinge points, or the seed is none.
+        MapError: the objects are too large for any lattice, or the seed is none.
     """
     return _fit(observations, MapConfig() if config is None else config, seed, prior)
 
@@ -108,9 +108,10 @@ def _fit(
 ) -> VPrismMap:
     """`fit_map`; `known` are warnings of an earlier map of some of the views."""
     problem = learning_problem(observations, config, seed)
-    views, ids, plane, space = problem.views, problem.object_ids, problem.plane, problem.space
+    config, views, ids, plane, space = (
+        problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
+    )  # fmt: skip
     members, field = problem.members, None
-    weights = weight_prior(space, config, len(ids) + 1, members)
     if prior is not None and config.prior_hidden_variance is not None:
 
         def under_table(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -129,6 +130,8 @@ def _fit(
         variance = correction_variances(space, config, depth)
         mean = np.zeros((space.size, len(ids) + 1))
         weights = diagonal_prior(space, mean, variance, members)
+    else:
+        weights = weight_prior(space, config, len(ids) + 1, members)
     posterior = _learn(space, problem.data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
@@ -157,6 +160,7 @@ class LearningProblem:
     """What a map is learned from, and in which features.
 
     Attributes:
+        config: parameters, coarser than asked for where the scene is too large.
         views: the observations.
         object_ids: sorted labels of the objects.
         plane: support surface, world frame.
@@ -166,6 +170,7 @@ class LearningProblem:
         warnings: what was odd about the views.
     """
 
+    config: MapConfig
     views: tuple[Observation, ...]
     object_ids: tuple[int, ...]
     plane: Plane
@@ -191,14 +196,11 @@ def learning_problem(
     object_ids = _object_ids(views)
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
-    space = FeatureSpace(
-        sorted_hinges(new_hinges(data, object_ids, views, plane, config, rng)),
-        config.gamma,
-        config.cutoff_radius,
-    )
-    warnings = (*warnings, *_without_return(views, object_ids))
-    members = local_features(space.hinges, data.lower, data.upper, config.class_reach)
-    return LearningProblem(views, object_ids, plane, data, space, members, warnings)
+    hinges, used, coarser = _hinges_within_budget(data, object_ids, views, plane, config, rng)
+    space = FeatureSpace(sorted_hinges(hinges), used.gamma, used.cutoff_radius)
+    warnings = (*warnings, *_without_return(views, object_ids), *coarser)
+    members = local_features(space.hinges, data.lower, data.upper, used.class_reach)
+    return LearningProblem(used, views, object_ids, plane, data, space, members, warnings)
 
 
 def _views(observations: Any) -> tuple[Observation, ...]:
@@ -242,7 +244,9 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     # New ground is where the old lattice did not reach: nodes it already has stay its own.
     added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
     hinges = np.concatenate([old.space.hinges, added])
-    _check_hinge_count(len(hinges), data, config)
+    if len(hinges) > config.max_hinges:
+        logger.info("all %d views are fitted together, on a coarser lattice", len(views))
+        return _fit(views, config, old.seed, None, old.warnings)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     members = np.zeros((old.n_classes, space.size), dtype=bool)
@@ -363,9 +367,67 @@ def new_hinges(
         needed |= ~outside_boxes(lattice, lower, upper, config.hinge_margin)
         lattice = lattice[needed]
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
-    hinges = np.concatenate([lattice, surface])
-    _check_hinge_count(len(hinges), data, config)
-    return hinges
+    return np.concatenate([lattice, surface])
+
+
+_COARSEST = 3.0  # times the lattice that was asked for; beyond, a scene is no tabletop
+_CROWDED = 50.0  # nodes of the objects' boxes per hinge point of the budget, at most to be listed
+
+
+def _hinges_within_budget(
+    data: TrainingData,
+    object_ids: tuple[int, ...],
+    views: Sequence[Observation],
+    plane: Plane,
+    config: MapConfig,
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "h 3"], MapConfig, list[str]]:
+    """Return at most `max_hinges` hinge points, the parameters that make so few, and a warning
+    where those are not `config`: spacing and kernel grow together, so that the prior stays.
+
+    Raises:
+        MapError: no lattice that resolves anything is coarse enough.
+    """
+    asked, needed = config, 0
+    extent = data.upper - data.lower + 2.0 * max(config.hinge_margin, config.hinge_radius)
+    while True:
+        listed = float((extent / config.hinge_spacing + 1.0).prod(axis=1).sum())
+        count, budget = listed, _CROWDED * config.max_hinges
+        if listed <= budget:
+            hinges = new_hinges(data, object_ids, views, plane, config, rng)
+            count, budget = len(hinges), float(config.max_hinges)
+        needed = needed or int(count)
+        if count <= budget:
+            break
+        factor = max(1.02, (count / budget) ** (1.0 / 3.0))
+        config = replace(
+            config,
+            hinge_spacing=factor * config.hinge_spacing,
+            gamma=config.gamma / factor**2,
+            hinge_reach=None if config.hinge_reach is None else factor * config.hinge_reach,
+        )
+        if config.hinge_spacing > _COARSEST * asked.hinge_spacing:
+            raise MapError(
+                f"the scene needs {needed} hinge points, more than max_hinges = "
+                f"{config.max_hinges}, and {_size(data)}"
+            )
+    if config is asked:
+        return hinges, config, []
+    return hinges, config, [
+        f"the scene would need {needed} hinge points, more than max_hinges = {config.max_hinges}: "
+        f"they are {1e3 * config.hinge_spacing:.0f} mm apart instead of "
+        f"{1e3 * asked.hinge_spacing:.0f}, with kernels of {1e3 * config.kernel_length:.0f} mm "
+        f"instead of {1e3 * asked.kernel_length:.0f}, which blurs surfaces and gaps as wide as "
+        f"that; {_size(data)}"
+    ]  # fmt: skip
+
+
+def _size(data: TrainingData) -> str:
+    size = float((data.upper - data.lower).max())
+    return (
+        f"its largest object measures {size:.2f} m: if that is wrong, check labels and the "
+        "scale of depth (metres), else label less or raise max_hinges"
+    )
 
 
 def _learn(
@@ -386,16 +448,6 @@ def _learn(
         tolerance=config.tolerance,
         offset=None if field is None else field.at(data.points),
     )  # fmt: skip
-
-
-def _check_hinge_count(count: int, data: TrainingData, config: MapConfig) -> None:
-    if count > config.max_hinges:
-        size = float((data.upper - data.lower).max())
-        raise MapError(
-            f"the scene needs {count} hinge points, more than max_hinges = {config.max_hinges}; "
-            f"its largest object measures {size:.2f} m: if that is wrong, check labels and the "
-            "scale of depth (metres), else raise max_hinges or hinge_spacing, or label less"
-        )
 
 
 def _usable(
@@ -448,10 +500,10 @@ def _near_any(
     points: Float[np.ndarray, "n 3"], centers: Float[np.ndarray, "c 3"], radius: float
 ) -> Float[np.ndarray, "m 3"]:
     """Keep the points within `radius` of a centre."""
-    near = np.zeros(len(points), dtype=bool)
-    for center in centers:
-        near |= ((points - center) ** 2).sum(axis=1) <= radius**2
-    return points[near]
+    from scipy.spatial import cKDTree
+
+    nearest, _ = cKDTree(centers).query(points, distance_upper_bound=radius)
+    return points[np.isfinite(nearest)]
 
 
 def _farther_than(

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
-from vprism_plan.errors import MapError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.perception.camera import invert_transform, project, transform_points
 from vprism_plan.perception.observation import Observation
@@ -39,12 +38,6 @@ def lattice_hinges(
         reach_high = np.maximum(high + config.hinge_margin, center + config.hinge_radius)
         first = np.ceil((reach_low - shift) / spacing)
         last = np.floor((reach_high - shift) / spacing)
-        if np.prod(last - first + 1.0) > 50.0 * config.max_hinges:
-            raise MapError(
-                f"an object's box is {np.round(high - low, 3).tolist()} m wide, too many hinge "
-                f"points at {spacing} m; check its labels and the scale of depth (metres), or "
-                "raise hinge_spacing"
-            )
         axes = [np.arange(a, b + 1.0) for a, b in zip(first, last, strict=True)]
         index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         nodes = index * spacing + shift

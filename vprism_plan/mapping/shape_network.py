@@ -24,6 +24,7 @@ from torch.nn import functional
 from vprism_plan._files import reading
 from vprism_plan._resources import data_path
 from vprism_plan.errors import MapError
+from vprism_plan.mapping.factors import run_per_class
 from vprism_plan.mapping.prior import FLAT_OCCUPANCY, SIDE, Crop, Guess, object_crops
 from vprism_plan.perception.camera import invert_transform, transform_points
 from vprism_plan.perception.observation import Observation
@@ -192,13 +193,16 @@ class ShapePrior:
     ) -> Guess:
         """Return what the network thinks of every object; the same views give the same bits."""
         crops = object_crops(views, object_ids, plane)
-        found = []
-        # One at a time: a batch's bits may depend on its size.
-        for crop, object_id in zip(crops, object_ids, strict=True):
-            features = torch.from_numpy(crop_features(crop, views, object_id))
+        found = np.empty((len(crops), 2, SIDE, SIDE, SIDE))
+
+        def ask(k: int) -> None:
+            features = torch.from_numpy(crop_features(crops[k], views, object_ids[k]))
             x = features[None].to(self._device)
             # Five times faster on a CPU than the default layout.
             x = x.contiguous(memory_format=torch.channels_last_3d)
-            with torch.no_grad():
-                found.append(self.network(x)[0].double().cpu().numpy())
-        return NetworkGuess(crops, np.stack(found))
+            with torch.inference_mode():
+                found[k] = self.network(x)[0].double().cpu().numpy()
+
+        # One at a time in each thread: a batch's bits may depend on its size.
+        run_per_class(ask, len(crops))
+        return NetworkGuess(crops, found)
