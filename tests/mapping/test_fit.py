@@ -251,20 +251,9 @@ def test_a_scene_that_outgrows_the_budget_gets_a_coarser_lattice(scene, second_v
     assert len(again.space.hinges) <= tight.max_hinges
 
 
-def test_a_carton_is_no_error_and_a_house_is(scene):
-    """Lengths ten times too large are the usual mistake of units."""
-    obs, plane = scene.observation, Plane([0.0, 0.0, 1.0], 0.0)
-    pose = obs.pose.copy()
-    for factor, refused in ((5.0, False), (40.0, True)):
-        pose[:3, 3] = factor * obs.pose[:3, 3]
-        large = Observation(
-            factor * obs.depth, obs.labels, obs.intrinsics, pose, plane=plane, max_range=1e3
-        )
-        if refused:
-            with pytest.raises(MapError, match="max_hinges"):
-                fit_map(large, prior=None)
-        else:
-            assert "max_hinges" in fit_map(large, prior=None).warnings[-1]
+def test_a_budget_that_no_lattice_meets_is_refused(scene):
+    with pytest.raises(MapError, match="more than max_hinges = 10, and its largest object"):
+        fit_map(scene.observation, MapConfig(max_hinges=10))
 
 
 def test_the_empty_posterior_of_a_map_says_its_prior_everywhere(scene):

@@ -713,12 +713,10 @@ def normalised_log_probabilities(mean, var, lo, hi, out):
 # ---------------------------------------------------------------- envelopes
 @njit(cache=True, nogil=True, fastmath=False)
 def unpack(data, row_first, base, out):
-    """A symmetric matrix into the dense, zeroed `out`."""
+    """The lower triangle of a matrix into the dense, zeroed `out`."""
     for i in range(len(base)):
         for j in range(row_first[i], i + 1):
-            value = data[base[i] + j]
-            out[i, j] = value
-            out[j, i] = value
+            out[i, j] = data[base[i] + j]
 
 
 @njit(cache=True, nogil=True, fastmath=False)

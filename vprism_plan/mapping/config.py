@@ -129,7 +129,7 @@ class MapConfig:
     box_trim: float = 0.01
     stray_share: float = 0.03
     surface_hinges: int = 0
-    max_hinges: int = 6000
+    max_hinges: int = 5000
     iterations: int = 4
     variational_updates: int = 3
     relaxation: float = 1.9

@@ -276,11 +276,10 @@ def fit_weights(
         m: Float[np.ndarray, "n k"], v: Float[np.ndarray, "n k"], start: Float[np.ndarray, "n k"]
     ) -> _Variational:
         """Return alpha and xi that raise the bound of logits with these moments."""
-        weight = bouchard_lambda(start)
+        xi = start
         for _ in range(variational_updates):
-            alpha = update_alpha(m, weight)
+            alpha = update_alpha(m, bouchard_lambda(xi))
             xi = update_xi(m, v, alpha)
-            weight = bouchard_lambda(xi)
         return _Variational(alpha, xi)
 
     used = _Variational(np.zeros(len(labels)), np.ones((len(labels), classes)))

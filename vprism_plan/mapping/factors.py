@@ -44,6 +44,11 @@ def run_per_class(work: Callable[[int], None], classes: int) -> None:
 
 def dense(space: FeatureSpace, data: Float[np.ndarray, " e"]) -> Float[np.ndarray, "m m"]:
     """Return a symmetric matrix, dense; zeros outside the envelope."""
+    lower = _lower(space, data)
+    return lower + np.tril(lower, -1).T
+
+
+def _lower(space: FeatureSpace, data: Float[np.ndarray, " e"]) -> Float[np.ndarray, "m m"]:
     out = np.zeros((space.size, space.size))
     kernels.unpack(data, space.row_first, space.base, out)
     return out
@@ -68,7 +73,7 @@ def _block_columns(space: FeatureSpace) -> list[tuple[int, int, int]]:
 def _factor_in_place(matrix: torch.Tensor, columns: list[tuple[int, int, int]]) -> float:
     """Replace a matrix by its Cholesky factor inside the envelope; return the log determinant.
 
-    Both triangles are given; of the result only the lower one counts.
+    Only lower triangles count.
     """
     log_determinant = 0.0
     bias = matrix.shape[0] - 1
@@ -148,7 +153,7 @@ def inverse(
     """Return mean, covariance and log determinant of a precision; information is precision times
     mean."""
     columns = _block_columns(space)
-    matrix = torch.from_numpy(dense(space, precision))
+    matrix = torch.from_numpy(_lower(space, precision))
     log_determinant = _factor_in_place(matrix, columns)
     mean = torch.from_numpy(information.copy())
     _solve_in_place(matrix, mean[:, None], columns, 2)
@@ -166,7 +171,7 @@ def correlate(
     The precision is L L^T, so L^-T noise has the covariance (L L^T)^-1.
     """
     columns = _block_columns(space)
-    factor = torch.from_numpy(dense(space, precision))
+    factor = torch.from_numpy(_lower(space, precision))
     _factor_in_place(factor, columns)
     draws = torch.from_numpy(noise.copy())
     _solve_in_place(factor, draws, columns, 1)

@@ -143,9 +143,9 @@ def _guessing(prior: Any) -> Prior:
     """Return the prior that was asked for."""
     if isinstance(prior, str):
         choice("prior", prior, ["shape"], error=MapError)
-        from vprism_plan.mapping.shape_network import ShapePrior
+        from vprism_plan.mapping.shape_network import own_prior
 
-        return ShapePrior()
+        return own_prior()
     if not callable(prior):
         raise MapError(
             f"prior is a {type(prior).__name__}; give 'shape', None, a MeshPrior, or a function "
@@ -500,10 +500,11 @@ def _near_any(
     points: Float[np.ndarray, "n 3"], centers: Float[np.ndarray, "c 3"], radius: float
 ) -> Float[np.ndarray, "m 3"]:
     """Keep the points within `radius` of a centre."""
-    from scipy.spatial import cKDTree
-
-    nearest, _ = cKDTree(centers).query(points, distance_upper_bound=radius)
-    return points[np.isfinite(nearest)]
+    near = np.zeros(len(points), dtype=bool)
+    for center in centers:
+        away = points - center
+        near |= np.einsum("na,na->n", away, away) <= radius**2
+    return points[near]
 
 
 def _farther_than(

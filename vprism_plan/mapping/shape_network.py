@@ -10,6 +10,7 @@ counted in voxels, so that large objects are seen as small ones are.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,10 @@ _WIDTHS = (12, 32, 64, 96)
 
 
 def crop_features(
-    crop: Crop, views: Sequence[Observation], object_id: int
+    crop: Crop,
+    views: Sequence[Observation],
+    object_id: int,
+    clouds: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Float[np.ndarray, "c x y z"]:
     """Return what labelled views say of a crop's voxels, float32 within [-1, 1].
 
@@ -45,13 +49,15 @@ def crop_features(
     at 4 voxels), way behind it (at 20), whether the pixel is labelled as this object, as
     another one, has a depth; height above the support surface; seen points of this object
     and of others in the voxel; edge of a voxel; whether any view looks there. Of several
-    views, the one that sees farthest through a voxel speaks for it.
+    views, the one that sees farthest through a voxel speaks for it. `clouds` are what
+    `Observation.points` says of the views, for who asks of many crops.
     """
+    clouds = [view.points() for view in views] if clouds is None else clouds
     centers = crop.centers()
     best = np.full(len(centers), -np.inf)
     said = np.zeros((4, len(centers)), dtype=np.float32)  # own, other, depth, looked at
     counts = np.zeros((2, SIDE, SIDE, SIDE), dtype=np.float32)
-    for view in views:
+    for view, (cloud, owner) in zip(views, clouds, strict=True):
         labels = view.labels
         assert labels is not None
         height, width = view.depth.shape
@@ -73,11 +79,10 @@ def crop_features(
         best = np.where(wins, way, best)
         spoken = np.stack([label == object_id, (label > 0) & (label != object_id), valid, inside])
         said[:, wins] = (spoken & inside)[:, wins]
-        cloud, owner = view.points()
         at = np.rint(crop.to_voxels(cloud[owner > 0])).astype(np.int64)
-        owner = owner[owner > 0]
+        owned = owner[owner > 0]
         held = ((at >= 0) & (at < SIDE)).all(axis=1)
-        np.add.at(counts, (np.where(owner[held] == object_id, 0, 1), *at[held].T), 1.0)
+        np.add.at(counts, (np.where(owned[held] == object_id, 0, 1), *at[held].T), 1.0)
     known = said[2] > 0.0
     up = ((np.arange(SIDE) + 0.5) * crop.voxel + crop.floor) / (SIDE * crop.voxel)
     shape = (SIDE, SIDE, SIDE)
@@ -141,7 +146,11 @@ class NetworkGuess:
         """Return P(class) at points (m, world)."""
         own = np.zeros((len(points), len(self.crops)))
         anything, weight = np.zeros(len(points)), np.zeros(len(points))
+        low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
         for k, (crop, grids) in enumerate(zip(self.crops, self.log_odds, strict=True)):
+            middle = transform_points(crop.T_world_crop, np.full((1, 3), 0.5 * SIDE * crop.voxel))
+            if np.linalg.norm(middle - middle.clip(low, high)) > SIDE * crop.voxel:
+                continue  # farther than its corners: who asks of one crop pays for few others
             at = crop.to_voxels(points)
             rows = np.flatnonzero(((at >= 0.0) & (at <= SIDE - 1.0)).all(axis=1))
             own[rows, k], other = expit(_interpolated(grids, at[rows]))
@@ -193,10 +202,11 @@ class ShapePrior:
     ) -> Guess:
         """Return what the network thinks of every object; the same views give the same bits."""
         crops = object_crops(views, object_ids, plane)
+        clouds = [view.points() for view in views]
         found = np.empty((len(crops), 2, SIDE, SIDE, SIDE))
 
         def ask(k: int) -> None:
-            features = torch.from_numpy(crop_features(crops[k], views, object_ids[k]))
+            features = torch.from_numpy(crop_features(crops[k], views, object_ids[k], clouds))
             x = features[None].to(self._device)
             # Five times faster on a CPU than the default layout.
             x = x.contiguous(memory_format=torch.channels_last_3d)
@@ -206,3 +216,9 @@ class ShapePrior:
         # One at a time in each thread: a batch's bits may depend on its size.
         run_per_class(ask, len(crops))
         return NetworkGuess(crops, found)
+
+
+@cache
+def own_prior() -> ShapePrior:
+    """Return the package's own prior, read once."""
+    return ShapePrior()
