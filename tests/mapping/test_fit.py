@@ -8,7 +8,7 @@ import pytest
 
 from vprism_plan.errors import MapError, ObservationError, PlaneNotFoundError
 from vprism_plan.mapping import MapConfig, fit_map
-from vprism_plan.mapping.em import Posterior, expand_prior, weight_prior
+from vprism_plan.mapping.em import expand_prior, weight_prior
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.fitting import training_data
 from vprism_plan.mapping.posterior import VPrismMap
@@ -256,41 +256,26 @@ def test_a_budget_that_no_lattice_meets_is_refused(scene):
         fit_map(scene.observation, MapConfig(max_hinges=10))
 
 
-def test_the_empty_posterior_of_a_map_says_its_prior_everywhere(scene):
-    """Whether an object has hinges at a place or none, what nobody looked at is 0.2 occupied."""
-    config = MapConfig()
-    space = fit_map(scene.observation, prior=None).space
-    for count in (0, 1, 3):
-        members = np.zeros((5, space.size), dtype=bool)
-        members[: count + 1], members[:, -1] = True, True
-        classes = weight_prior(space, config, 5, members)
-        flat = VPrismMap(
-            config, (1, 2, 3, 4), Plane([0.0, 0.0, 1.0], 0.0), (), space, Posterior(classes, ()), 0
-        )
-        middle = space.hinges[flat.support(space.hinges) > 0.95 * config.mean_feature_sum]
-        points = middle + np.random.default_rng(0).uniform(-0.5, 0.5, middle.shape) * 0.028
-        assert flat.occupancy(points).mean() == pytest.approx(0.2, abs=0.03)
-
-
-def test_objects_are_local(scene, default_map):
-    """An object has the hinges near its box; elsewhere its logit is its prior's."""
-    reach, everywhere = default_map.config.class_reach, default_map.space
+def test_around_a_guess_objects_are_local(scene, default_map):
+    """An object has the hinges near its box; elsewhere its logit is the guess."""
+    fitted = fit_map(scene.observation)
+    reach, everywhere = fitted.config.class_reach, fitted.space
     points, labels = scene.observation.points()
-    empty, *objects = default_map.posterior.classes
+    empty, *objects = fitted.posterior.classes
     assert empty.space is everywhere
     for k, own in enumerate(objects, start=1):
-        seen = points[labels == default_map.object_ids[k - 1]]
+        seen = points[labels == fitted.object_ids[k - 1]]
         low, high = seen.min(0) - reach - 1e-9, seen.max(0) + reach + 1e-9
         hinges = own.space.hinges
         assert ((hinges > low) & (hinges < high)).all()
         assert 0 < len(hinges) < len(everywhere.hinges)
-        far = everywhere.hinges[
-            np.linalg.norm(everywhere.hinges[:, None] - hinges, axis=2).min(1)
-            > default_map.cutoff_radius
-        ]
-        mean, variance = default_map.logit_moments(far)
-        np.testing.assert_array_equal(mean[:, k], own.mean[-1])
+        apart = np.linalg.norm(everywhere.hinges[:, None] - hinges, axis=2).min(1)
+        far = everywhere.hinges[apart > fitted.cutoff_radius]
+        mean, variance = fitted.logit_moments(far)
+        np.testing.assert_array_equal(mean[:, k], own.mean[-1] + fitted.prior.at(far)[:, k])
         np.testing.assert_array_equal(variance[:, k], own.covariance[-1])
+    # Without a guess kernels alone say what is behind an object.
+    assert all(own.space is default_map.space for own in default_map.posterior.classes)
 
 
 def test_the_repr_is_short(small_map):

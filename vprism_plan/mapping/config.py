@@ -21,7 +21,8 @@ _NOT_NEGATIVE = (
     "hinge_margin", "hinge_depth", "hinge_reach", "class_reach", "tolerance", "below_plane_margin",
 )  # fmt: skip
 _WHOLE = {
-    "surface_hinges": 0, "iterations": 1, "variational_updates": 1, "below_plane_samples": 0,
+    "surface_hinges": 0, "iterations": 1, "guessed_iterations": 1,
+    "variational_updates": 1, "below_plane_samples": 0,
     "max_points": 1, "max_hinges": 1,
 }  # fmt: skip
 _OPTIONAL = frozenset(
@@ -64,9 +65,9 @@ class MapConfig:
             two kernel lengths, or surfaces move. None keeps all (the paper). A quarter of
             the lattice tells only what the depth image tells, and the fit's cost grows
             with the cube of its nodes.
-        class_reach: an object has the hinges at most this far from its box, m; elsewhere its
-            logit is its prior's, and only "empty" learns. None gives it all of them (the
-            paper).
+        class_reach: around a guess of the hidden side an object has the hinges at most this
+            far from its box, m; elsewhere its logit is the guess, and only "empty" learns.
+            With None, or without a guess, it has all of them (the paper).
         surface_hinges: random surface points taken as hinges, per object. Where the
             lattice is coarse they add detail; where it is fine they add prior variance
             in random places, and lose accuracy.
@@ -74,7 +75,8 @@ class MapConfig:
             do). Where a scene needs more, spacing and kernel grow together until it does not,
             and the map warns of it; its `config` holds what was used.
     Learning
-        iterations: EM iterations at most.
+        iterations: EM iterations at most ...
+        guessed_iterations: ... and around a guess of the hidden side, near which it starts.
         variational_updates: alternations of alpha and xi per iteration (the paper: 1).
             They cost no matrix work and only ever raise the bound.
         relaxation: how many times as far as EM's own step every iteration goes (the
@@ -130,7 +132,8 @@ class MapConfig:
     stray_share: float = 0.03
     surface_hinges: int = 0
     max_hinges: int = 5000
-    iterations: int = 4
+    iterations: int = 6
+    guessed_iterations: int = 4
     variational_updates: int = 3
     relaxation: float = 1.9
     start_variance: float = 10.0
@@ -210,6 +213,7 @@ class MapConfig:
             surface_hinges=32,
             max_hinges=6000,
             iterations=3,
+            guessed_iterations=3,
             variational_updates=1,
             relaxation=1.0,
             start_variance=1.0,
@@ -247,6 +251,7 @@ class MapConfig:
             hinge_spacing=0.028,
             hinge_reach=None,
             iterations=10,
+            guessed_iterations=10,
             prior_logit_variance=10.0,
             object_resolution=0.01,
             front_resolution=0.01,

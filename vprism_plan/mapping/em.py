@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Softmax EM with Bouchard's bound (section IV, algorithm 1), sparse and in float64.
 
-Classes are local: every class has hinge points of its own, "empty" all of them. Where a class
-has none, its logit is its prior's.
+Classes may be local: each has hinge points of its own, "empty" all of them. Where a class has
+none, its logit is its prior's.
 
 Per iteration the cost is N n^2 / 2 multiply-adds for the Gram blocks and as many for the
 quadratic forms (N points, n active hinges per point and class), plus one Cholesky factor
@@ -16,9 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int, Int64
-from scipy.optimize import brentq
 
 from vprism_plan._kernels import mapping as kernels
 from vprism_plan._threads import run_chunked, worker_count
@@ -26,7 +24,6 @@ from vprism_plan.errors import MapError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.factors import inverse, run_per_class
 from vprism_plan.mapping.features import BlockFeatures, FeatureSpace
-from vprism_plan.mapping.prediction import occupied_probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,59 +307,38 @@ def fit_weights(
     return Posterior(tuple(best), tuple(history))
 
 
-def empty_logit(occupancy: float, classes: int, variance: float, elsewhere: int = 0) -> float:
+def empty_logit(occupancy: float, classes: int, variance: float) -> float:
     """Mean logit of the empty class for which a flat posterior says P(occupied) = occupancy.
 
-    All other logits have mean 0, all have the given variance, but for `elsewhere` objects,
-    which have none. With C = K - 1 objects, none of them elsewhere, and t = exp(m / sqrt(1 +
-    pi/4 variance)) the approximation gives q_0 = t / (C + t) and q_k = 1 / (C + t) for each
-    object, so P(empty) / P(occupied) = t / C: solved for m.
+    All other logits have mean 0, all have the given variance. With C = K - 1 objects and
+    t = exp(m / sqrt(1 + pi/4 variance)) the approximation gives q_0 = t / (C + t) and
+    q_k = 1 / (C + t) for each object, so P(empty) / P(occupied) = t / C: solved for m.
     """
+    objects = classes - 1
     odds = (1.0 - occupancy) / occupancy
-    equal = math.log((classes - 1) * odds) * math.sqrt(1.0 + math.pi / 4.0 * variance)
-    if elsewhere == 0:
-        return equal
-    spread = torch.full((1, classes), variance, dtype=torch.float64)
-    spread[0, classes - elsewhere :] = 0.0
-
-    def excess(logit: float) -> float:
-        mean = torch.zeros_like(spread)
-        mean[0, 0] = logit
-        return float(occupied_probability(mean, spread)) - occupancy
-
-    return float(brentq(excess, -abs(equal) - 1.0, abs(equal) + 1.0))
+    return math.log(objects * odds) * math.sqrt(1.0 + math.pi / 4.0 * variance)
 
 
-def prior_means(config: MapConfig, classes: int, elsewhere: int = 0) -> tuple[float, float]:
+def prior_means(config: MapConfig, classes: int) -> tuple[float, float]:
     """Prior mean of the empty class's hinge weights and of its bias weight.
 
     Out of the hinges' reach only the bias acts, inside the lattice the kernels add a
     variance: each gets the mean that makes its flat prediction `config.prior_occupancy`.
-    `elsewhere` objects have no hinges there.
     """
     if config.prior_occupancy is None:
         return 0.0, 0.0
     outside = empty_logit(config.prior_occupancy, classes, config.bias_variance)
     inside = empty_logit(
-        config.prior_occupancy, classes, config.bias_variance + config.logit_variance, elsewhere
+        config.prior_occupancy, classes, config.bias_variance + config.logit_variance
     )
     return (inside - outside) / config.mean_feature_sum, outside
 
 
-def weight_prior(
-    space: FeatureSpace,
-    config: MapConfig,
-    classes: int,
-    members: Bool[np.ndarray, "k m"] | None = None,
-) -> tuple[Weights, ...]:
+def weight_prior(space: FeatureSpace, config: MapConfig, classes: int) -> tuple[Weights, ...]:
     """Return the prior of all weights, independent between features and classes."""
-    members = every_member(space, classes) if members is None else members
-    elsewhere = (~members).sum(axis=0)
     mean = np.zeros((space.size, classes))
-    for count in np.unique(elsewhere):
-        mean[elsewhere == count, 0] = prior_means(config, classes, int(count))[0]
-    mean[-1, 0] = prior_means(config, classes)[1]
-    return diagonal_prior(space, mean, weight_variances(space, config), members)
+    mean[:-1, 0], mean[-1, 0] = prior_means(config, classes)
+    return diagonal_prior(space, mean, weight_variances(space, config))
 
 
 def weight_variances(space: FeatureSpace, config: MapConfig) -> Float[np.ndarray, " m"]:
@@ -399,7 +375,8 @@ def expand_prior(
     Weights that the old one has keep their joint posterior; the others enter independent,
     with `fresh`, a diagonal prior of all of `space`.
     """
-    place = places(old_space, space)
+    position = {row.tobytes(): i for i, row in enumerate(space.hinges)}
+    place = np.array([*(position[row.tobytes()] for row in old_space.hinges), space.size - 1])
     found = []
     for before, own in zip(old.classes, fresh, strict=True):
         target = np.searchsorted(own.members, place[before.members])
@@ -417,9 +394,3 @@ def expand_prior(
         determinant = before.log_determinant + float(gained)
         found.append(Weights(own.members, own.space, mean, precision, covariance, determinant))
     return tuple(found)
-
-
-def places(old: FeatureSpace, space: FeatureSpace) -> Int64[np.ndarray, " m"]:
-    """Return where each feature of a space is in a larger one."""
-    position = {row.tobytes(): i for i, row in enumerate(space.hinges)}
-    return np.array([*(position[row.tobytes()] for row in old.hinges), space.size - 1])

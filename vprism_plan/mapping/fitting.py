@@ -19,7 +19,6 @@ from vprism_plan.mapping.em import (
     diagonal_prior,
     expand_prior,
     fit_weights,
-    places,
     weight_prior,
 )
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
@@ -111,7 +110,7 @@ def _fit(
     config, views, ids, plane, space = (
         problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
     )  # fmt: skip
-    members, field = problem.members, None
+    field = None
     if prior is not None and config.prior_hidden_variance is not None:
 
         def under_table(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -129,9 +128,11 @@ def _fit(
         depth = hidden_depth(space.hinges, views)
         variance = correction_variances(space, config, depth)
         mean = np.zeros((space.size, len(ids) + 1))
+        low, high = problem.data.lower, problem.data.upper
+        members = local_features(space.hinges, low, high, config.class_reach)
         weights = diagonal_prior(space, mean, variance, members)
     else:
-        weights = weight_prior(space, config, len(ids) + 1, members)
+        weights = weight_prior(space, config, len(ids) + 1)
     posterior = _learn(space, problem.data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
@@ -166,7 +167,6 @@ class LearningProblem:
         plane: support surface, world frame.
         data: labelled points.
         space: hinge points and kernel.
-        members: which features each class has.
         warnings: what was odd about the views.
     """
 
@@ -176,7 +176,6 @@ class LearningProblem:
     plane: Plane
     data: TrainingData
     space: FeatureSpace
-    members: Bool[np.ndarray, "k m"]
     warnings: tuple[str, ...]
 
 
@@ -199,8 +198,7 @@ def learning_problem(
     hinges, used, coarser = _hinges_within_budget(data, object_ids, views, plane, config, rng)
     space = FeatureSpace(sorted_hinges(hinges), used.gamma, used.cutoff_radius)
     warnings = (*warnings, *_without_return(views, object_ids), *coarser)
-    members = local_features(space.hinges, data.lower, data.upper, used.class_reach)
-    return LearningProblem(used, views, object_ids, plane, data, space, members, warnings)
+    return LearningProblem(used, views, object_ids, plane, data, space, warnings)
 
 
 def _views(observations: Any) -> tuple[Observation, ...]:
@@ -249,12 +247,7 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
         return _fit(views, config, old.seed, None, old.warnings)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
-    members = np.zeros((old.n_classes, space.size), dtype=bool)
-    members[class_of] = local_features(space.hinges, data.lower, data.upper, config.class_reach)
-    place = places(old.space, space)
-    for own, before in zip(members, old.posterior.classes, strict=True):
-        own[place[before.members]] = True
-    fresh = weight_prior(space, config, old.n_classes, members)
+    fresh = weight_prior(space, config, old.n_classes)
     weights = expand_prior(old.space, old.posterior, space, fresh)
     data = TrainingData(
         data.points, class_of[data.classes], data.lower, data.upper, data.surface,
@@ -441,7 +434,10 @@ def _learn(
     )  # fmt: skip
     return fit_weights(
         features, data.classes, weights,
-        iterations=config.iterations,
+        iterations=(
+            config.iterations if field is None
+            else min(config.iterations, config.guessed_iterations)
+        ),
         variational_updates=config.variational_updates,
         relaxation=config.relaxation,
         start_variance=config.start_variance,
