@@ -20,13 +20,13 @@ demo: $(STAMP)
 PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal --durations=40
 
 test: $(STAMP)
-	$(BIN)/python tests/compile_kernels.py
+	$(BIN)/vprism-plan warmup
 	$(PYTEST) -m "not slow"
 
 # Everything, with coverage and with types checked at run time: twice the work.
 TYPED := perception,mapping,world,robots,collision,planning,trajopt
 test-all: $(STAMP)
-	$(BIN)/python tests/compile_kernels.py
+	$(BIN)/vprism-plan warmup
 	$(PYTEST) --cov --cov-report=term:skip-covered \
 		--jaxtyping-packages=$(subst $(COMMA),$(COMMA)vprism_plan.,vprism_plan.$(TYPED)),beartype.beartype
 

@@ -236,3 +236,26 @@ def test_help_answers_at_once():
     )
     done = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_warmup_compiles_each_half_that_is_not_cached_in_a_process_of_its_own(capsys, monkeypatch):
+    started = []
+
+    class Compiler:
+        def __init__(self, command, **_):
+            started.append(command[-1])
+            self.code = command[-1] == "checks" and len(started) > 2
+
+        def wait(self):
+            return int(self.code)
+
+    monkeypatch.setattr("subprocess.Popen", Compiler)
+    monkeypatch.setattr("vprism_plan._kernels.jit.is_cached", lambda kernel: False)
+    assert call(capsys, "warmup")[0] == 0
+    assert started == ["maps", "checks"]
+    code, _, errors = call(capsys, "warmup")  # this time the checks fail
+    assert code == 2
+    assert "checks failed" in errors[0]
+    monkeypatch.setattr("vprism_plan._kernels.jit.is_cached", lambda kernel: True)
+    assert call(capsys, "warmup")[0] == 0
+    assert len(started) == 4

@@ -44,6 +44,12 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
+def is_cached(dispatcher: Any) -> bool | None:
+    """Whether code of a kernel as it is now lies on disk; None where nothing can be kept."""
+    file = getattr(dispatcher._cache, "_cache_file", None)
+    return None if file is None else bool(file._load_index())
+
+
 def _stamped(dispatcher: Any) -> Any:
     """Make cached code depend on all kernel files."""
     dispatcher._cache._cache_file._source_stamp = _digest()

@@ -73,7 +73,7 @@ def parse(arguments: Sequence[str]) -> Command:
         raise UsageError(f"no command given; see {PROGRAM} --help")
     parser = _Parser(PROGRAM, description=_DESCRIPTION)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_demo, _map, _plan, _query, _mesh, _view, _robot):
+    for add in (_demo, _map, _plan, _query, _mesh, _view, _robot, _warmup):
         lines = [line.strip() for line in (add.__doc__ or "").splitlines()]
         text = "\n".join(lines).strip()
         command = commands.add_parser(add.__name__[1:], help=lines[0], description=text)
@@ -212,6 +212,10 @@ def _robot(command: _Parser) -> None:
     take("--srdf-output FILE", Path, text)
     text = "write a picture: the collision geometry, and the spheres over it"
     take("--picture PNG", Path, text)
+
+
+def _warmup(command: _Parser) -> None:
+    """Compile the kernels now, on all cores, so that no later command waits for that."""
 
 
 def _results(command: _Parser, folder: str) -> None:

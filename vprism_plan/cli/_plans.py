@@ -14,6 +14,7 @@ from vprism_plan.cli._console import Console, dump_json, staged
 from vprism_plan.cli._maps import describe_map, fit_view, load, write_meshes
 from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import Surroundings, choose_ends, places
+from vprism_plan.cli._warmup import compile_checks_meanwhile
 from vprism_plan.errors import PlanningError
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def run_demo(command: Command, console: Console) -> int:
     from vprism_plan.world import World
 
     folder, seed = data_path("demo_scene"), command.seed
+    compile_checks_meanwhile()
     m = fit_view(folder, seed, console)
     with console.stage("bake"):
         world = World(m)
@@ -87,6 +89,7 @@ def run_plan(command: Command, console: Console) -> int:
     if command.input.suffix == ".safetensors":
         m = load(command.input, console)
     else:
+        compile_checks_meanwhile()
         m = fit_view(command.input, command.seed, console, command.frame)
     world = bake(m, command, console)
     around, ends = Surroundings.of(m), None
