@@ -7,6 +7,7 @@ processes keep two cores busy.
 
 import subprocess
 import sys
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,8 +38,8 @@ def start(job: str, quiet: bool = True) -> "subprocess.Popen[bytes]":
 
 def compile_checks_meanwhile() -> None:
     """Have another process compile the checks, if nobody has, while this one makes a map."""
-    if _is_done("checks") is False:
-        start("checks")
+    if _is_done("checks") is False:  # a thread waits for it: nobody else does
+        threading.Thread(target=start("checks").wait, daemon=True).start()
 
 
 def _is_done(job: str) -> bool | None:
