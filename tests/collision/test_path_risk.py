@@ -791,6 +791,33 @@ def test_a_tightened_checker_refuses_more_and_says_why(bounded, doubtful):
         CollisionChecker(checker.world, checker.robot, config(max_risk=None)).tightened(1)
 
 
+def test_worlds_that_the_ends_lose_are_not_counted_at_every_edge(bounded, doubtful):
+    rng = np.random.default_rng(17)
+    checker, verdicts = bounded[0.6], []
+    places = doubtful[~on_level_set(checker, doubtful)]
+    worlds = checker.world.posterior_worlds(128, 7, reach=0.25)
+    hit = worlds.touched(places, RADIUS + BLURRED)
+    for _ in range(12):
+        a, b, *others = rng.permutation(len(places))[:20]
+        lost = hit[a] | hit[b]
+        for level in (1, 3, 7):
+            stricter = checker.tightened(level, places[[a, b]])
+            left = max(0, checker._bounded.allowed - lost.sum()) >> level
+            expected = [(hit[q] & ~lost).sum() <= left for q in (a, b, *others)]
+            assert expected[:2] == [True, True]
+            np.testing.assert_array_equal(
+                stricter.is_valid_batch(places[[a, b, *others]]), expected
+            )
+            assert [stricter.is_valid(places[q]) for q in (a, b, *others)] == expected
+            verdicts += expected[2:]
+            for q in others[:4]:
+                edge = places[[a, q]]
+                if stricter.check_motion(*edge):
+                    swept = count_path(checker._bounded._kept, edge).touched > 0
+                    assert (swept & ~lost).sum() <= left
+    assert 0.1 < np.mean(verdicts) < 0.9
+
+
 def test_a_refusal_for_risk_names_links_objects_and_shares(bounded, doubtful):
     rng = np.random.default_rng(9)
     risky = 0

@@ -32,7 +32,7 @@ class RiskyDisks(disk_world.DiskChecker):
         self.gain, self.levels, self.level = gain, levels, 0
         self.asked = []
 
-    def tightened(self, level):
+    def tightened(self, level, ends):
         if level > self.levels:
             return None
         stricter = RiskyDisks(self, self.max_risk, self.first_risk, self.gain, self.levels)
@@ -96,8 +96,8 @@ def test_a_refusal_of_the_tighter_search_keeps_the_path_that_was_found():
     closed = disk_world.closed_wall()
     tightened = checker.tightened
 
-    def close(level):
-        stricter = tightened(level)
+    def close(level, ends):
+        stricter = tightened(level, ends)
         stricter.centers, stricter.radii = closed.centers, closed.radii
         return stricter
 
@@ -115,8 +115,8 @@ def test_an_end_that_the_tighter_bound_refuses_is_not_waited_for(end, clock):
     tightened = checker.tightened
     asked = []
 
-    def cover(level):
-        stricter = tightened(level)
+    def cover(level, ends):
+        stricter = tightened(level, ends)
         stricter.centers = np.concatenate([stricter.centers, [end]])
         stricter.radii = np.append(stricter.radii, 0.05)
         stricter.check_motion_buffer = lambda *ends: asked.append(ends) or False
@@ -176,7 +176,7 @@ def test_drawing_worlds_under_a_wide_margin_leaves_the_last_one_its_time():
             wider.radii, wider.asked = self.radii + extra, self.asked
             return wider
 
-        def tightened(self, level):
+        def tightened(self, level, ends):
             return None
 
         def collision_probability(self, path, held_out=False):

@@ -238,17 +238,20 @@ class CollisionChecker(explain.Checker):
             risk=risk,
         )
 
-    def tightened(self, level: int) -> "CollisionChecker | None":
+    def tightened(self, level: int, ends: Any = None) -> "CollisionChecker | None":
         """Return a checker with a stricter bound on risk; None if there is no stricter one.
 
         Each edge of a path may be within `max_risk` and the path still above it. Level by level
         fewer worlds may collide with an edge, then none, then the spheres grow by up to two voxels.
-        Everything is shared with this checker, whose verdicts include those of the stricter one.
-        ConfigError without a `max_risk`.
+        Worlds in which the robot collides at `ends` (n, dof), if they are given, are lost anyhow:
+        what is left of the bound is for the others, and verdicts count these alone.
+        Everything is shared with this checker, whose verdicts include those of the stricter one
+        between such ends. ConfigError without a `max_risk`.
         """
         if self._bounded is None:
             raise ConfigError("max_risk is None; only a bound on risk can be tightened")
-        bounded = self._bounded.tightened(level)
+        ends = None if ends is None else configurations(self.robot, ends)
+        bounded = self._bounded.tightened(level, ends)
         return None if bounded is None else self._with(_bounded=bounded)
 
     def with_extra_margin(self, extra: float) -> "CollisionChecker":

@@ -318,6 +318,7 @@ class PathRisk:
         hidden = worlds.error_free + (worlds.error_occupied if any(rules) else 0.0)
         self._upper = np.minimum(upper + hidden, 1.0)
         self._held_out: PathRisk | None = None
+        self._lost = np.zeros(config.n_worlds, np.bool_)  # worlds that no verdict counts
         self.allowed = 0
         if config.max_risk is not None:
             self.allowed = tolerated_hits(config.max_risk, self._upper, config.n_worlds)
@@ -331,16 +332,21 @@ class PathRisk:
         other.allowed = tolerated_hits(float(config.max_risk or 0.0), self._upper, config.n_worlds)
         return other
 
-    def tightened(self, level: int) -> "PathRisk | None":
+    def tightened(self, level: int, ends: Rows | None = None) -> "PathRisk | None":
         """Return the same with a stricter bound on verdicts, None if there is none left: halves
-        the worlds that may collide, down to none, then grows the spheres by `PADDINGS`."""
+        the worlds that may collide, down to none, then grows the spheres by `PADDINGS`. Worlds that
+        collide at `ends` are lost to every path between them: they count once, not at each edge."""
         stricter = copy.copy(self)
         halvings = self.allowed.bit_length()  # after so many, none is left
-        stricter.allowed = self.allowed >> min(level, halvings)
         if level > halvings:
             if level - halvings > len(PADDINGS):
                 return None
             stricter._kept = grown(self._kept, PADDINGS[level - halvings - 1])
+        stricter._lost = self._lost
+        if ends is not None:
+            stricter._lost = count_each(stricter._kept, ends).touched > 0
+        left = max(0, self.allowed - int(stricter._lost.sum()))
+        stricter.allowed = left >> min(level, halvings)
         return stricter
 
     def held_out(self) -> "PathRisk":
@@ -355,21 +361,29 @@ class PathRisk:
 
     def accepts(self, path: Waypoints) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
-        obstacles aside."""
-        return bool(count_path(self._kept, path, self.allowed).touched.sum() <= self.allowed)
+        obstacles and worlds that are lost aside."""
+        return self._accepted(count_path(self._kept, path, self.allowed))
 
     def accepts_one(self, q: Configuration) -> bool:
         """Return `accepts` of one configuration: the quick way."""
-        return count_at(self._kept, q)[1] <= self.allowed
+        if count_at(self._kept, q)[1] <= self.allowed:
+            return True
+        return bool(self._lost.any()) and self._accepted(count_each(self._kept, q[None]))
 
     def accepts_each(self, Q: Rows) -> Chosen:
         """Return `accepts` of each configuration by itself."""
-        return count_each(self._kept, Q).counts <= self.allowed
+        found = count_each(self._kept, Q).counts <= self.allowed
+        if self._lost.any():
+            found[~found] = [self._accepted(count_each(self._kept, q[None])) for q in Q[~found]]
+        return found
+
+    def _accepted(self, sweep: Sweep) -> bool:
+        return int((sweep.touched[~self._lost] > 0).sum()) <= self.allowed
 
     def exceeded_at(self, edge: Float[np.ndarray, "2 dof"]) -> float:
         """Return where along an edge, 0 to 1, more worlds have collided than are allowed."""
         sweep = count_path(self._kept, edge, self.allowed)
-        first = np.sort(sweep.first[sweep.first >= 0])
+        first = np.sort(sweep.first[(sweep.first >= 0) & ~self._lost])
         return float(first[self.allowed]) / max(1, len(sweep.counts) - 1)
 
     def contacts(self, q: Configuration) -> tuple[Contact, ...]:

@@ -47,8 +47,8 @@ def within_risk(
     """Plan until the joint risk of the whole path is within the checker's `max_risk`.
 
     The estimate comes from worlds that the search has not seen, by its upper confidence
-    bound. While it exceeds the bound and time is left, the edges are held to a stricter
-    one (`checker.tightened`). A checker without a bound is asked once. No further attempt
+    bound. While it exceeds the bound and time is left, the edges between its ends are held to a
+    stricter one (`checker.tightened`). A checker without a bound is asked once. No further attempt
     starts after `time_limit` seconds, those spent on estimates (the first draws the worlds)
     left out. Returns the first path within the bound; otherwise the least risky one as
     "too_risky", or the refusal of the first attempt.
@@ -59,8 +59,9 @@ def within_risk(
         return attempt(checker, time_limit, 0)
     began, spent = now(), 0.0
     best: PlanResult | None = None
+    ends: np.ndarray | None = None
     for level in count():
-        judge = bounded.tightened(level) if level else checker
+        judge = bounded.tightened(level, ends) if level else checker
         left = time_limit - (now() - began - spent) if level else time_limit
         if judge is None or (level and left <= 0.0):
             break
@@ -73,7 +74,8 @@ def within_risk(
         if result.report.risk is None:
             result = _with_risk(bounded, result, now)
             spent += result.report.risk_time
-        risk = result.report.risk
+        assert result.path is not None
+        risk, ends = result.report.risk, result.path[[0, -1]]
         report = replace(result.report, risk_levels=level, risk_time=spent)
         if risk.upper <= max_risk:
             return replace(result, report=report, message=f"{result.message}; {risk.text()}")

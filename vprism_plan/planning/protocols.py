@@ -48,8 +48,8 @@ class CheckerLike(Protocol):
 
     The two `*_buffer` forms take float64 C-contiguous arrays of length dof, unchecked (but NaN
     is never valid), and must be safe to call from several threads. With a `max_risk` that is not
-    None, `collision_probability(path, held_out=True)` and `tightened(level)` are asked, too;
-    see `attempts.within_risk`.
+    None, `collision_probability(path, held_out=True)` and `tightened(level, ends)` are asked,
+    too; see `attempts.within_risk`.
     """
 
     @property
