@@ -121,12 +121,14 @@ def choose_ends(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return start and goal; what is None is chosen on the other side of the objects.
 
-    A given start or goal is kept as it is, valid or not: that verdict is the planner's.
+    A given start or goal is kept as it is, valid or not: that verdict is the planner's. What is
+    chosen takes, if it can, a quarter of the checker's bound on risk: the way needs the rest.
     None if nothing valid was found for what is open.
     """
     from vprism_plan.viz import hand_path
 
     robot = checker.robot
+    careful = None if checker.max_risk is None else checker.tightened(2)
     ahead = around.middle - robot.base_pose[:2, 3]
     ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
     aside = np.array([-ahead[1], ahead[0]])
@@ -145,7 +147,11 @@ def choose_ends(
     def reach(sign: float, like: np.ndarray) -> np.ndarray | None:
         target, edge = left if sign > 0 else right, around.half_width(leftward[:2])
         outward = sign * leftward
-        return _reach_for(checker, target, lambda p: (p - middle) @ outward > edge, like, rng)
+        for judge in filter(None, (careful, checker)):
+            q = _reach_for(judge, target, lambda p: (p - middle) @ outward > edge, like, rng)
+            if q is not None:
+                return q
+        return None
 
     first = None if start is None else np.asarray(start, dtype=np.float64)
     last = None if goal is None else np.asarray(goal, dtype=np.float64)
