@@ -17,7 +17,6 @@ from vprism_plan.mapping import MapConfig, MeshPrior, fit_map, load_map
 from vprism_plan.mapping.prior import (
     FLAT_OCCUPANCY,
     MOST,
-    SEEN,
     SIDE,
     Crop,
     PriorField,
@@ -56,7 +55,7 @@ def textbook(field, points):
             min(max(min(*at, *(SIDE - 1.0 - at)) / 2.0, 0.0), 1.0) for at in places
         ]  # of an object's own grid, from its side inwards
         for k, (at, share) in enumerate(zip(places, shares, strict=True)):
-            other = (1.0 - max(shares)) * flat + max(shares) * -SEEN
+            other = (1.0 - max(shares)) * flat + max(shares) * -MOST
             own = trilinear(field.log_odds[k], at)
             expected[row, 1 + k] = share * own + (1.0 - share) * other
     return expected

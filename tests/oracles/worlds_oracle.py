@@ -18,8 +18,10 @@ def draw_logits(map_, points, n_worlds, seed, thresholds=True):
         logits += map_.prior.at(points)[:, None]
     if not thresholds:
         return logits
-    known = np.asarray(map_.informed(points))
-    for row in np.flatnonzero(known):
+    if map_.prior is None:
+        return logits
+    guess = map_.prior.at(points)[:, 1:].max(axis=1)  # -7 at the least: seen to be empty
+    for row in np.flatnonzero(np.asarray(map_.informed(points)) & (guess > -6.99)):
         logits[row, :, 1:] += threshold(points[row], n_worlds, seed)[:, None]
     return logits
 

@@ -18,10 +18,11 @@ from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior, Weights
 from vprism_plan.mapping.factors import correlate, dense, run_per_class
 from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
-from vprism_plan.mapping.prior import PriorField
+from vprism_plan.mapping.prior import MOST, PriorField
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
+_SURE = 0.01 - MOST  # log-odds up to which a guess is as sure of nothing as it can be
 MAX_LOG_ODDS = 40.0  # exp(-40) is 4e-18: nothing a float64 probability could still tell from 0
 
 
@@ -192,6 +193,14 @@ class VPrismMap:
         says of everything: where a prior has looked, (N,)."""
         points = np.asarray(points)
         return np.zeros(len(points), bool) if self.prior is None else self.prior.covers(points)
+
+    def doubts(self, points: Any) -> Bool[np.ndarray, " n"]:
+        """Return where a prior has looked (`informed`) and is not as sure as it can be that
+        nothing is there, as it is of all that was seen to be empty, (N,)."""
+        points = np.asarray(points)
+        if self.prior is None:
+            return np.zeros(len(points), bool)
+        return self.prior.covers(points) & (self.prior.at(points)[:, 1:].max(axis=1) > _SURE)
 
     def logit_moments(
         self, points: Any

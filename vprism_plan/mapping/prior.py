@@ -43,9 +43,6 @@ _COARSE = 0.025  # metres between the nodes around the grids ...
 _AROUND = 0.1  # ... and how far they reach beyond them
 _MOST_NODES = 200_000
 MOST = 7.0  # log-odds: no guess is surer than 0.999
-# Log-odds of being empty of what was seen to be, and of being another object's in a grid: of a
-# dozen objects they add up to less than 1 / 512, the least that any draw occupies.
-SEEN = 9.0
 FLAT_OCCUPANCY = 0.2  # P(occupied) where nobody guesses
 
 
@@ -238,7 +235,7 @@ class PriorField:
         ]
         covered = torch.stack(shares).amax(dim=0)
         flat = _sampled(self.elsewhere, _transformed(self.T_node_world, points))
-        other = flat + covered * (-SEEN - flat)  # in another object's grid it is not this one
+        other = flat + covered * (-MOST - flat)  # in another object's grid it is not this one
         columns = [torch.zeros_like(flat)]
         for grid, at, share in zip(self.log_odds, places, shares, strict=True):
             rows = (share > 0.0).nonzero()[:, 0]
@@ -283,7 +280,7 @@ class PriorField:
     @property
     def _grids(self) -> tuple[Any, ...]:
         """What the kernels take after points."""
-        return self.T_voxel_world, self.log_odds, self.T_node_world, self.elsewhere, FADE, -SEEN
+        return self.T_voxel_world, self.log_odds, self.T_node_world, self.elsewhere, FADE, -MOST
 
     def bounds(
         self, centers: Float[np.ndarray, "n 3"], half: float
@@ -407,7 +404,7 @@ def prior_field(
         points = crop.centers()
         proba = _checked(guess(points), (len(points), len(crops) + 1))
         odds = np.log(np.maximum(proba[:, index + 1], tiny) / np.maximum(proba[:, 0], tiny))
-        odds = np.where(empty(points), -SEEN, np.clip(odds, -MOST, MOST))
+        odds = np.where(empty(points), -MOST, np.clip(odds, -MOST, MOST))
         grids.append(odds.reshape(SIDE, SIDE, SIDE).astype(np.float32))
         corners += [points.min(axis=0), points.max(axis=0)]
     lower, upper = np.min(corners, axis=0) - _AROUND, np.max(corners, axis=0) + _AROUND
@@ -416,7 +413,7 @@ def prior_field(
     nodes = lower + step * np.moveaxis(np.indices(shape), 0, -1).reshape(-1, 3)
     # Of each object, so that all together say `occupancy`.
     unknown = math.log(occupancy / (1.0 - occupancy) / len(crops))
-    flat = np.where(empty(nodes), -SEEN, unknown)
+    flat = np.where(empty(nodes), -MOST, unknown)
     return PriorField(
         np.stack([crop.T_voxel_world() for crop in crops]),
         np.stack(grids),

@@ -48,8 +48,9 @@ class PosteriorWorlds:
     The thresholds t_s are logistic: a map that says P(occupied) = 0.2, and is sure of that, is
     occupied in a fifth of the draws. They are independent at the nodes of a lattice 5 cm apart
     and vary slowly between them: what hides in one place is correlated with what hides next to
-    it, and says little of what hides behind the other end of an object. Where no prior has looked
-    (`VPrismMap.informed`), and the map only says that nobody knows, they are 0.
+    it, and says little of what hides behind the other end of an object. Where no prior has looked,
+    and the map only says that nobody knows, and where it was seen to be empty, they are 0
+    (`VPrismMap.doubts`).
 
     The surface of a draw lies between voxels, where its log-odds, linear between centres, are 0.
     An occupied voxel stands for the ball around its centre that reaches to the surface (at most a
@@ -446,7 +447,7 @@ def _tails(
         piece, rows = slice(layers.start * slab, layers.stop * slab), np.arange(len(points))
         gap = mean[:, 1:] - mean[:, :1]
         spread = np.sqrt(variance[:, 1:] + variance[:, :1])
-        most = np.where(map_.informed(points), _MOST, 0.0) + np.log(n_objects)
+        most = np.where(map_.doubts(points), _MOST, 0.0) + np.log(n_objects)
         occupied[piece] = ndtr((gap + most[:, None]) / spread).sum(axis=1)
         best = gap.argmax(axis=1)
         apart = np.sqrt(variance[rows, 1 + best, None] + variance[:, 1:])
@@ -613,7 +614,7 @@ class Owners:
         prior = np.zeros((len(points), weights.shape[1]))
         if self._map.prior is not None:
             prior = self._map.prior.at(points)
-        own = self._map.informed(points)
+        own = self._map.doubts(points)
 
         def draw(piece: slice) -> None:
             kernels.draw_voxels(
