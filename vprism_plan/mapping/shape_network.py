@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from safetensors.torch import load_file
 from scipy.ndimage import map_coordinates
-from scipy.special import expit, logit
+from scipy.special import expit
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -33,7 +33,6 @@ from vprism_plan.perception.plane import Plane
 
 CHANNELS = 10
 _NEAR, _FAR = 4.0, 20.0  # voxels at which ways to the seen surface are cut off
-_SURENESS = 0.8  # times the network's log-odds: it is too sure of the hidden side of scenes
 _WIDTHS = (12, 32, 64, 96)
 
 
@@ -161,8 +160,7 @@ class NetworkGuess:
         covered = weight > 0.0
         anything = np.where(covered, anything / np.maximum(weight, 1e-12), FLAT_OCCUPANCY)
         together = own.sum(axis=1)
-        guess = np.clip(np.maximum(anything, together), 1e-6, 1.0 - 1e-6)
-        occupied = expit(_SURENESS * logit(guess))
+        occupied = np.clip(np.maximum(anything, together), 1e-6, 1.0 - 1e-6)
         # What is no object of its own is some object's: the likeliest ones take the rest.
         share = (own + 1e-4) / (together + 1e-4 * own.shape[1])[:, None]
         return np.column_stack([1.0 - occupied, occupied[:, None] * share])
