@@ -23,26 +23,30 @@ from vprism_plan.simulation.scenes import random_scene
 
 
 class DenseSolves:
-    """Prediction with a dense solve per call and class."""
+    """Prediction with a dense solve per call and class, over the weights that the class has."""
 
     def __init__(self, fitted: VPrismMap) -> None:
-        every = torch.eye(fitted.space.size).repeat(fitted.n_classes, 1, 1) * 1e30
-        for matrix, own in zip(every, fitted.posterior.classes, strict=True):
-            where = np.ix_(own.members, own.members)
-            matrix[where] = torch.from_numpy(dense(own.space, own.precision)).float()
-        self.precision = every  # weights that a class does not have are surely 0
+        classes = fitted.posterior.classes
+        self.members = [torch.from_numpy(own.members) for own in classes]
+        self.precision = [
+            torch.from_numpy(dense(own.space, own.precision)).float() for own in classes
+        ]
         self.mean = torch.from_numpy(fitted.posterior.mean).float()
-        self.hinges = fitted.hinge_points.float()
-        self.gamma = fitted.space.gamma
+        self.hinges, self.gamma = fitted.hinge_points.float(), fitted.space.gamma
+        self.prior = fitted.prior
 
     def __call__(self, points: torch.Tensor) -> torch.Tensor:
         phi = torch.exp(-self.gamma * torch.cdist(points, self.hinges) ** 2)
         phi = torch.cat([phi, torch.ones(len(points), 1)], dim=1)
-        solved = [torch.linalg.solve(a, phi.T) for a in self.precision]
-        variance = torch.stack([(phi.T * s).sum(dim=0) for s in solved], dim=1)
         m = phi @ self.mean
+        if self.prior is not None:
+            m += torch.from_numpy(self.prior.at(points.double().numpy())).float()
+        own = [phi[:, members].T for members in self.members]
+        solved = [torch.linalg.solve(a, b) for a, b in zip(self.precision, own, strict=True)]
+        variance = [(b * s).sum(dim=0) for b, s in zip(own, solved, strict=True)]
+        v = torch.stack(variance, dim=1)
+        spread = torch.sqrt(1.0 + math.pi / 8.0 * (v[:, None, :] + v[:, :, None]))
         gap = m[:, None, :] - m[:, :, None]
-        spread = torch.sqrt(1.0 + math.pi / 8.0 * (variance[:, None, :] + variance[:, :, None]))
         return torch.softmax(-torch.logsumexp(gap / spread, dim=2), dim=1)
 
 
