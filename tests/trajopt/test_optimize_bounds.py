@@ -47,7 +47,7 @@ class NearIsRisky(DiskChecker):
         self.__dict__.update(inner.__dict__)
         self.inner, self.max_risk, self.levels, self.asked = inner, max_risk, levels, []
 
-    def tightened(self, level):
+    def tightened(self, level, ends):
         if level > self.levels:
             return None
         stricter = NearIsRisky(self.inner, self.max_risk, self.levels)
