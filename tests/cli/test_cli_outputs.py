@@ -10,7 +10,7 @@ import vprism_plan as vp
 from vprism_plan.cli import main
 from vprism_plan.cli._console import Console, dump_json, staged
 from vprism_plan.cli._parsing import UsageError, parse
-from vprism_plan.cli._placing import Surroundings, candidate_bases
+from vprism_plan.cli._placing import Surroundings, candidate_bases, choose_ends
 from vprism_plan.cli._plans import PLAN_FILES, dense_path, pose_matrix, true_distance
 from vprism_plan.errors import PlanningError, VPrismError
 
@@ -182,6 +182,24 @@ def test_bases_stand_beside_the_objects_and_face_them(demo_map, repository):
         assert pose[:2, 0] @ ahead == pytest.approx(np.linalg.norm(ahead))
         assert np.linalg.norm(ahead) > around.half_width(ahead / np.linalg.norm(ahead)) + 0.19
         assert pose[2, 3] == pytest.approx(0.0, abs=0.005)
+
+
+def test_ends_that_are_chosen_leave_most_of_a_bound_to_the_way(demo_map, repository, monkeypatch):
+    around = Surroundings.of(demo_map)
+    urdf = repository / "urdf" / "panda.urdf"
+    pose = around.base_pose([0.05, -0.6, 0.0], np.pi / 2)
+    checker = vp.CollisionChecker(vp.World(demo_map), vp.Robot.from_urdf(urdf, base_pose=pose))
+    allowed = checker._bounded.allowed
+    asked = []
+
+    def reach(judge, *_):
+        asked.append(judge._bounded.allowed)
+        return judge.robot.neutral if len(asked) != 1 else None
+
+    monkeypatch.setattr("vprism_plan.cli._placing._reach_for", reach)
+    assert choose_ends(checker, around, np.random.default_rng(0)) is not None
+    assert allowed > 4
+    assert asked == [allowed // 4, allowed, allowed // 4]  # the first found nothing so careful
 
 
 @pytest.mark.slow

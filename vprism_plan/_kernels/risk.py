@@ -134,9 +134,9 @@ def classify(logits, owners, odds):
                 owners[s] = k
             best[s] = max(best[s], row[s])
     if n_classes > 2:
-        power = np.empty(n_draws, np.int32)
         for k in range(1, n_classes):
-            _add_exp(logits[k], best, power, power.view(np.float32), total)
+            for s in range(n_draws):
+                total[s] += np.exp(logits[k, s] - best[s])
     for s in range(n_draws):
         gap = best[s] - logits[0, s]
         if n_classes > 2 and abs(gap) * ODDS < MOST_ODDS:
@@ -145,25 +145,6 @@ def classify(logits, owners, odds):
         odds[s] = steps if gap > 0.0 else -steps
         if gap <= 0.0:
             owners[s] = 0
-
-
-@njit(cache=True, nogil=True)
-def _add_exp(row, best, bits, power, total):
-    """total (S,) += exp(row - best), which is at most 1, to 2e-7: Moshier, "Cephes" (expf), in
-    loops that run on vectors. bits, and the same memory as power: scratch."""
-    for s in range(row.size):
-        x = max(row[s] - best[s], np.float32(-80.0))
-        n = np.floor(np.float32(1.44269504) * x + np.float32(0.5))
-        x = (x - n * np.float32(0.693359375)) + n * np.float32(2.12194440e-4)
-        p = np.float32(1.9875691500e-4) * x + np.float32(1.3981999507e-3)
-        p = p * x + np.float32(8.3334519073e-3)
-        p = p * x + np.float32(4.1665795894e-2)
-        p = p * x + np.float32(1.6666665459e-1)
-        p = p * x + np.float32(5.0000001201e-1)
-        row[s] = (p * x) * x + x + np.float32(1.0)
-        bits[s] = (np.int32(n) + np.int32(127)) << np.int32(23)
-    for s in range(row.size):
-        total[s] += row[s] * power[s]
 
 
 @njit(cache=True, nogil=True)

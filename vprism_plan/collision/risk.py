@@ -342,7 +342,6 @@ class PathRisk:
             if level - halvings > len(PADDINGS):
                 return None
             stricter._kept = grown(self._kept, PADDINGS[level - halvings - 1])
-        stricter._lost = self._lost
         if ends is not None:
             stricter._lost = count_each(stricter._kept, ends).touched > 0
         left = max(0, self.allowed - int(stricter._lost.sum()))

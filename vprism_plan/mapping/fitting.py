@@ -51,6 +51,9 @@ from vprism_plan.perception.sanity import examine
 
 logger = logging.getLogger(__name__)
 
+_COARSEST = 3.0  # times the lattice that was asked for; beyond, a scene is no tabletop
+_CROWDED = 50.0  # nodes of the objects' boxes per hinge point of the budget, at most to be listed
+
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
@@ -361,10 +364,6 @@ def new_hinges(
         lattice = lattice[needed]
     surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
     return np.concatenate([lattice, surface])
-
-
-_COARSEST = 3.0  # times the lattice that was asked for; beyond, a scene is no tabletop
-_CROWDED = 50.0  # nodes of the objects' boxes per hinge point of the budget, at most to be listed
 
 
 def _hinges_within_budget(

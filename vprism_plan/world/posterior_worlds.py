@@ -472,7 +472,7 @@ def _skippable(bound: Values, budget: float) -> Chosen:
     return skip
 
 
-def doubts(
+def threshold_nodes(
     lower: Index, shape: Shape3, n_worlds: int, seed: int
 ) -> Float32[np.ndarray, "nx ny nz s"]:
     """Standard normal numbers of S draws at the nodes `lower` + (0, ..., shape - 1) of the lattice
@@ -580,7 +580,7 @@ class Owners:
             low = np.floor(self._resolution / APART * self.first).astype(np.int64)
             high = np.floor(self._resolution / APART * (self.first + self.row.shape))
             x, y, z = (high.astype(np.int64) - low + 2).tolist()
-            self._doubts = APART * low, doubts(low, (x, y, z), self._n_worlds, self._seed)
+            self._doubts = APART * low, threshold_nodes(low, (x, y, z), self._n_worlds, self._seed)
             self._weights = np.ascontiguousarray(weights.transpose(1, 2, 0), np.float32)
             self._used = self._weights.any(axis=2)
         return self._weights
