@@ -48,7 +48,7 @@ def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
         for k, object_id in enumerate(map_.object_ids, start=1):
             own = np.flatnonzero(labels == object_id)
-            own = own[beside(points[own], ~stray_points(points[own], _STRAY_SHARE))]
+            own = own[_of_surfaces(points[own])]
             if plane is not None:
                 sigma = height_sigma(points[own] - view.camera_center, depth[own], plane.normal)
                 height = plane.signed_distance(points[own])
@@ -56,6 +56,11 @@ def surface_points(map_: Any, bounded: bool = False) -> list[Surface]:
                 own = own[height > np.maximum(THIN, 3.0 * sigma)]
             found.append((k, points[own], 0.5 * depth[own] / focal))
     return found
+
+
+def _of_surfaces(points: Points) -> Chosen:
+    """Which points of one object are no flying pixels."""
+    return beside(points, ~stray_points(points, _STRAY_SHARE))
 
 
 def off_level_set(points: Points, distance: Nodes, grid: Grid) -> Chosen:
@@ -103,8 +108,9 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
     plane through the front of its foot, of its other points and of what is seen beside its mask,
     moved towards the camera by half its width; the height of 40 cm; and its own nearest seen
     surface, continued towards the camera at two metres per metre. Farthest is that surface
-    continued away from the camera. Holes of up to four pixels, and outlines frayed by two, have no
-    cone: every depth camera has them all around. Specks of returns do not make a hole of glass.
+    continued away from the camera; flying pixels are no surface. Holes of up to four pixels, and
+    outlines frayed by two, have no cone: every depth camera has them all around. Specks of returns
+    do not make a hole of glass.
     """
     found: list[Cone] = []
     for object_id in lost_objects(view):
@@ -116,13 +122,15 @@ def lost_cones(view: Observation, plane: Plane | None) -> list[Cone]:
         if not lost.any():
             continue
         rays = pixel_rays(view.shape, view.intrinsics)[window] @ view.pose[:3, :3].T
-        start, end = _beside_own_surface(view, depth, mask)
+        points = view.point_image()[window]
+        own = mask & (depth > 0)
+        own[own] = _of_surfaces(points[own])
+        start, end = _beside_own_surface(view, depth, own)
         if plane is not None:
             sinking = -(rays @ plane.normal)
             at_plane = np.full(mask.shape, np.inf)
             height = float(plane.signed_distance(view.camera_center))
             at_plane[sinking > 0.0] = height / sinking[sinking > 0.0]
-            points = view.point_image()[window]
             foot = _before_foot(view, plane, mask, lost, rays, points, at_plane)
             start, end = np.maximum(start, foot), np.minimum(end, at_plane)
         lost &= start < end
@@ -157,12 +165,11 @@ def lost_points(
             yield cone.object_id, points, 0.71 * depth / focal + 0.5 * step
 
 
-def _beside_own_surface(view: Observation, depth: Image, mask: Mask) -> tuple[Image, Image]:
+def _beside_own_surface(view: Observation, depth: Image, own: Mask) -> tuple[Image, Image]:
     """Nearest and farthest depth that the object's own seen pixels allow; 0, inf without any."""
-    own = mask & (depth > 0)
     if not own.any():
-        return np.zeros(mask.shape), np.full(mask.shape, np.inf)
-    # Of several surfaces nearby, a flying pixel among them, each may be the one that goes on.
+        return np.zeros(own.shape), np.full(own.shape, np.inf)
+    # Of several surfaces nearby each may be the one that goes on.
     size = 2 * _BESIDE + 1
     low = ndimage.minimum_filter(np.where(own, depth, np.inf), size, mode="nearest")
     high = ndimage.maximum_filter(np.where(own, depth, 0.0), size, mode="nearest")
@@ -171,7 +178,7 @@ def _beside_own_surface(view: Observation, depth: Image, mask: Mask) -> tuple[Im
     # The way to the side is measured at the depth sought.
     steep = _SLOPE * away / focal
     start = np.maximum(low[tuple(index)] - _NEAR, 0.0) / (1.0 + steep)
-    end = np.full(mask.shape, np.inf)
+    end = np.full(own.shape, np.inf)
     near = steep < 1.0
     end[near] = (high[tuple(index)] + _NEAR)[near] / (1.0 - steep[near])
     return start, end
