@@ -195,7 +195,7 @@ def within_limits(q, rf, ri):
     return True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
     """Whether every moving link keeps more than the margin from the world.
 
@@ -277,7 +277,7 @@ def _place_pair(a, b, T, C, placed, rf, ri):
         place_link(b, T, rf, ri, C)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _self_clear(T, lc, C, placed, rf, ri):
     """Whether every pair of links keeps more than the self margin; bounding spheres first."""
     bo = ri[18]
@@ -357,7 +357,7 @@ def _scratch(ri):
     return np.empty((ri[0], 12)), np.empty((n_links, 3)), C, np.empty(n_links, np.bool_)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True)
 def _pose(q, rf, ri, T, lc, placed):
     """Place frames and link bounding spheres; no sphere is placed yet."""
     fk_frames(q, rf, ri, T)
