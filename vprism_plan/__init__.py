@@ -24,7 +24,8 @@ if TYPE_CHECKING:
         save_observation,
         segment_tabletop,
     )
-    from vprism_plan.planning import plan
+    from vprism_plan.planning.looking import NextView, next_view
+    from vprism_plan.planning.plan import plan
     from vprism_plan.robots import Robot
     from vprism_plan.world import PosteriorWorlds, World, WorldConfig, extract_meshes
 
@@ -45,6 +46,8 @@ _HOMES = {
     "load_observation": "perception",
     "save_observation": "perception",
     "segment_tabletop": "perception",
+    "NextView": "planning",
+    "next_view": "planning",
     "plan": "planning",
     "Robot": "robots",
     "PosteriorWorlds": "world",
@@ -58,6 +61,7 @@ __all__ = [
     "CollisionChecker",
     "MapConfig",
     "MeshChecker",
+    "NextView",
     "Observation",
     "PosteriorWorlds",
     "Robot",
@@ -74,6 +78,7 @@ __all__ = [
     "ignore_self",
     "load_map",
     "load_observation",
+    "next_view",
     "plan",
     "save_observation",
     "segment_tabletop",

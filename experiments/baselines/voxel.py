@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from experiments.baselines import voxel_rays
 from experiments.baselines._common import counts_per_voxel, one_hot
 from experiments.protocols import checked_points
-from vprism_plan._kernels import rays
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.training_data import stray_points
 from vprism_plan.perception.observation import Observation
@@ -78,7 +78,7 @@ def observed_voxels(
     last = np.ceil((own.max(axis=0) + REACH) / edge).astype(np.int64)
     shape = tuple((last + 1 - first).tolist())
     observed = np.zeros(shape, dtype=bool)
-    rays.mark_passed(points, observation.camera_center, edge * (first - 0.5), edge, observed)
+    voxel_rays.mark_passed(points, observation.camera_center, edge * (first - 0.5), edge, observed)
     classes = np.zeros(shape, dtype=np.int64)
     most = np.zeros(shape, dtype=np.int64)
     for k, object_id in enumerate(observation.object_ids, start=1):

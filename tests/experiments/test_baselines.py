@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from oracles import dense_em, ray_oracles
 from oracles.small_scenes import small_scene
 
-from experiments.baselines import METHODS, method, octomap, sgd, sigmoid, voxel
+from experiments.baselines import METHODS, method, octomap, sgd, sigmoid, voxel, voxel_rays
 from experiments.baselines.pointsdf import weights as pointsdf_weights
-from vprism_plan._kernels import rays
 from vprism_plan.errors import ConfigError, MapError, ObservationError
 from vprism_plan.mapping import MapConfig, VPrismMap, fit_map
 from vprism_plan.mapping.fitting import learning_problem
@@ -174,7 +173,7 @@ def test_rays_mark_exactly_the_voxels_they_pass(seed):
     points = rng.normal(size=(3, 3)) * 0.5
     points[0, seed % 3] = origin[seed % 3]  # one ray is parallel to a side
     passed = np.zeros(shape, dtype=bool)
-    rays.mark_passed(points, origin, lower, edge, passed)
+    voxel_rays.mark_passed(points, origin, lower, edge, passed)
     length = ray_oracles.passed_lengths(points, origin, lower, edge, shape)
     assert passed[length > 1e-9].all()
     assert (length[passed] > 0.0).all() or (length[passed] >= -1e-9).all()

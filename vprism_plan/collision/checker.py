@@ -399,6 +399,7 @@ class CollisionChecker(explain.Checker):
                 )
             return self._path_risk
 
-    def risk_setting(self) -> Setting:
-        """Return what probabilities are counted with, for planners' objectives."""
-        return self._risk().setting
+    def risk_setting(self, held_out: bool = False) -> Setting:
+        """Return what probabilities are counted with; `held_out` as in `collision_probability`."""
+        risk = self._risk()
+        return (risk.held_out() if held_out else risk).setting

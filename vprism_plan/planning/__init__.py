@@ -3,6 +3,10 @@
 
 from vprism_plan.planning.goals import PoseGoalConfig as PoseGoalConfig
 from vprism_plan.planning.goals import ReachRegion as ReachRegion
+from vprism_plan.planning.looking import NextView as NextView
+from vprism_plan.planning.looking import ViewValue as ViewValue
+from vprism_plan.planning.looking import camera_views as camera_views
+from vprism_plan.planning.looking import next_view as next_view
 from vprism_plan.planning.objectives import RiskObjective as RiskObjective
 from vprism_plan.planning.objectives import VPrismMinimaxRiskObjective as VPrismMinimaxRiskObjective
 from vprism_plan.planning.objectives import VPrismRiskObjective as VPrismRiskObjective

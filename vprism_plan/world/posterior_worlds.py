@@ -245,6 +245,13 @@ class PosteriorWorlds:
         voxel, which is that of the tables and a halo."""
         return self._owners.row, self._owners.table, self._owners.first
 
+    def drawn(self) -> tuple[Any, Any, Any]:
+        """Return the `owner_tables` with every voxel drawn."""
+        blocks = np.arange(int(np.prod([-(-n // BLOCK) for n in self._owners.row.shape])))
+        with self._lock:
+            self._owners.draw(blocks)
+        return self.owner_tables
+
     def baked(self) -> tuple[Any, ...]:
         """What the kernels read: one snapshot of the tables, where they begin, and the scale."""
         now = self.tables

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Compiled kernel of the voxel baseline: which voxels rays pass through.
-
-It releases the GIL. A kernel calls only kernels of this file.
-"""
+"""Compiled kernel of the voxel baseline: which voxels rays pass through."""
 
 import math
 
+import numba
 import numpy as np
 
-from vprism_plan._kernels.jit import njit
 
-
-@njit(cache=True, nogil=True)
-def mark_passed(points, origin, lower, edge, passed):
+@numba.njit(cache=True, nogil=True)
+def mark_passed(  # noqa: PLR0912
+    points: np.ndarray, origin: np.ndarray, lower: np.ndarray, edge: float, passed: np.ndarray
+) -> None:
     """Mark every voxel that a segment from `origin` to a point enters.
 
     Voxel (i, j, k) spans `edge` from lower + edge * (i, j, k). The walk crosses one face
