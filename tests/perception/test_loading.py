@@ -254,9 +254,9 @@ FOLDER_FAULTS = {
         lambda f: write(f / "labels.png", np.ones((3, 3), np.uint8)),
         r"labels have shape \(3, 3\)",
     ),
-    "labels color": (
-        lambda f: write(f / "labels.png", np.ones((*SHAPE, 3), np.uint8)),
-        "single-channel",
+    "labels with alpha": (
+        lambda f: write(f / "labels.png", np.ones((*SHAPE, 2), np.uint8)),
+        "pixel format LA.*object ids",
     ),
     "color depth 16": (lambda f: write(f / "color.png", raw_depth()), "8-bit RGB"),
 }
@@ -332,7 +332,7 @@ def test_faulty_npz(tmp_path):
     with pytest.raises(ObservationError, match="without pickle"):
         load_observation(path)
     np.savez(path, depth=np.full((12, 16), -np.inf), intrinsics=K)
-    with pytest.raises(ObservationError, match="depth is -inf"):
+    with pytest.raises(ObservationError, match="infinite everywhere"):
         load_observation(path)
     for wrong in (np.ones(2), 0.0, "far"):
         np.savez(path, depth=np.ones((12, 16)), intrinsics=K, max_range=wrong)

@@ -40,7 +40,8 @@ def label_image(
         ObservationError: what is wrong, and what would be valid.
         MissingDependencyError: COCO's forms need the extra `formats`.
     """
-    masks, found = _listed(value), ()
+    masks = _listed(value)
+    found: tuple[str, ...] = ()
     if masks is None:
         array = to_numpy(value, "labels")
         if array.ndim == 4 and array.shape[1] == 1:

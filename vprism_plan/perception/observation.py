@@ -254,7 +254,7 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
         "return: is it the sensor's value for 'no data'? If they are real, raise max_range",
     )
     depth[beyond] = 0.0
-    return depth, (found,)
+    return depth, found
 
 
 def _check_scale(valid: np.ndarray, max_range: float) -> None:

@@ -225,7 +225,7 @@ def _pixel_size(image: np.ndarray, intrinsics: Matrix | None) -> tuple[float, in
     if len(distinct) < _FEWEST:
         raise ObservationError(f"only {len(distinct)} points are distinct as the camera sees them")
     asked = distinct[:: max(1, len(distinct) // _SAMPLE)]
-    gap = cKDTree(distinct).query(asked, _NEIGHBOURS + 1)[0][:, -1]
+    gap = np.asarray(cKDTree(distinct).query(asked, [_NEIGHBOURS + 1])[0]).ravel()
     # To the eighth neighbour it is 1.4 spacings on a square lattice, 1.6 at random.
     sparse = 1.1 * float(np.percentile(gap, _SPARSE))
     size = 0.75 * float(np.median(gap)) if intrinsics is None else 1.0 / intrinsics[0, 0]
