@@ -15,7 +15,7 @@ from scipy.io import savemat
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vprism_plan.errors import MissingDependencyError, ObservationError
+from vprism_plan.errors import MissingDependencyError
 from vprism_plan.perception import Observation, load_observation
 from vprism_plan.perception.camera import invert_transform, project, transform_points
 
@@ -333,7 +333,9 @@ def moved(seconds: float) -> np.ndarray:
     return pose
 
 
-def drive(bag: Bag, v, topic="/cam/depth/image_raw", info="/cam/depth/camera_info", lens=(), **more):
+def drive(
+    bag: Bag, v, topic="/cam/depth/image_raw", info="/cam/depth/camera_info", lens=(), **more
+):
     """Images every 0.1 s; TF of the hand every 0.08 s, never at the time of image 12."""
     start = 1_700_000_000 * 10**9
     bag.transform("/tf_static", start, "hand", "camera", invert_transform(moved(1.2)) @ POSE)
@@ -435,7 +437,9 @@ DOORS = {
         lambda v, r: folder(v, r, "camera_info.yaml", camera_info()), pose=False, warns=MM
     ),
     "CameraInfo, JSON": Door(
-        lambda v, r: folder(v, r, content={k.upper(): x for k, x in camera_info().items() if k == "k"}),
+        lambda v, r: folder(
+            v, r, content={k.upper(): x for k, x in camera_info().items() if k == "k"}
+        ),
         pose=False,
         warns=MM,
     ),

@@ -4,6 +4,7 @@
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from vprism_plan._arguments import rigid_pose
 from vprism_plan._shapes import Indices, Matrix, Pixels, PointImage, Points, Vector
@@ -19,8 +20,9 @@ _WIDEST = 3.0  # tangent of the angle off the axis that an image still shows: 72
 _MOST_ACROSS = 2000  # pixels of an image that is made
 _NEIGHBOURS = 8  # of a point; on a square lattice the pixels around it
 _SPARSE = 98.0  # percent of the points; where these few are sparser there may be holes
-_COARSEST = 16  # fine pixels across a coarse one
+_WIDEST_GAP = 16  # pixels
 _BEHIND, _MANY_BEHIND = 0.05, 0.1  # metres, share of the points
+_STEEP = 5.0  # how much farther a pixel's far side may be, in its widths: a slant of 79 degrees
 
 
 def image_of(points: Any, labels: Any, camera: Any, intrinsics: Any) -> dict[str, Any]:
@@ -42,7 +44,7 @@ def image_of(points: Any, labels: Any, camera: Any, intrinsics: Any) -> dict[str
         )
     found: tuple[str, ...] = ()
     if labels is not None:
-        value = labels if shape[1] > 1 else to_numpy(labels, "labels").reshape(shape[0], -1)
+        value = labels if shape[1] > 1 else to_numpy(labels, "labels").reshape(-1, 1)
         labels, found = label_image(value, shape)
     center, turn = _camera(camera, points[is_point])
     if min(shape) > 1:
@@ -156,9 +158,9 @@ def _unorganised(
 ) -> dict[str, Any]:
     """Return what a camera sees of points (relative to it) that it looks at.
 
-    Two images are made. A pixel of the coarse one, as wide as the widest gaps between points,
-    has the nearest point in it, and so surfaces have no holes. A pixel of the fine one has the
-    nearest point in it, if there is any, and else what the coarse one has.
+    A pixel has the nearest point in it. Where every window of pixels around it that is as wide
+    as gaps between points has a nearer one, it has the farthest of these: surfaces have no
+    holes, nothing shines through them, and outlines stay where they are (a grey closing).
     """
     turn = _towards(points) if turn is None else turn
     local = points @ turn
@@ -170,23 +172,19 @@ def _unorganised(
         )
     local, z = local[shown], local[shown, 2]
     image = local[:, :2] / z[:, None]
-    size, times = _pixel_size(image, intrinsics)
+    size, window = _pixel_size(image, intrinsics)
     low = np.minimum(image.min(axis=0), 0.0) - size
     column, row = np.floor((image - low) / size).astype(np.int64).T
-    across = np.maximum(np.floor(-low / size).astype(np.int64), [column.max(), row.max()]) + 1
-    width, height = (int(n) for n in -(-across // times) * times)
+    width, height = np.maximum([column.max(), row.max()], np.floor(-low / size).astype(int)) + 1
 
-    order = np.argsort(-z, kind="stable")  # of points in one pixel the last, the nearest, stays
-    depth = np.full((2, height, width), np.inf)
-    ids = np.zeros((2, height, width), dtype=np.int32)
-    for level, wide in enumerate((1, times)):
-        at = level, row[order] // wide, column[order] // wide
-        depth[at] = z[order]
-        if labels is not None:
-            ids[at] = labels[shown][order]
-    fine, spread = np.isfinite(depth[0]), np.indices((height, width)) // times
-    far = z > depth[0, row, column] + _BEHIND
-    depth, ids = (np.where(fine, v[0], v[1][tuple(spread)]) for v in (depth, ids))
+    # Points by nearness, from 1: of those in one pixel the last written, the nearest, stays.
+    order = np.argsort(-z, kind="stable")
+    nearness = np.zeros((height, width), dtype=np.int32)
+    nearness[row[order], column[order]] = np.arange(1, len(order) + 1)
+    point = np.append(-1, order)[ndimage.grey_closing(nearness, (window, window))]
+    depth = np.where(point < 0, 0.0, z[point])
+    ids = None if labels is None else np.where(point < 0, 0, labels[shown][point]).astype(np.int32)
+    far = z > depth[row, column] + _BEHIND + _STEEP * size * z
     found = []
     if not shown.all():
         found.append(
@@ -200,8 +198,8 @@ def _unorganised(
         )
     column0, row0 = -low / size - 0.5
     return {
-        "depth": depth,  # infinite where there is no point
-        "labels": None if labels is None else ids,
+        "depth": depth,
+        "labels": ids,
         "intrinsics": np.array([[1 / size, 0, column0], [0, 1 / size, row0], [0, 0, 1.0]]),
         "turn": turn,
         "warnings": tuple(found),
@@ -218,7 +216,8 @@ def _towards(points: Points) -> Matrix:
 
 
 def _pixel_size(image: np.ndarray, intrinsics: Matrix | None) -> tuple[float, int]:
-    """Return the width of a fine pixel at z = 1, and that of a coarse one in fine ones."""
+    """Return the width of a pixel at z = 1, and that of a window that always has a point, in
+    pixels and odd."""
     from scipy.spatial import cKDTree
 
     distinct = np.unique(image.round(7), axis=0)  # of merged clouds
@@ -229,5 +228,5 @@ def _pixel_size(image: np.ndarray, intrinsics: Matrix | None) -> tuple[float, in
     # To the eighth neighbour it is 1.4 spacings on a square lattice, 1.6 at random.
     sparse = 1.1 * float(np.percentile(gap, _SPARSE))
     size = 0.75 * float(np.median(gap)) if intrinsics is None else 1.0 / intrinsics[0, 0]
-    size = max(size, sparse / _COARSEST, float(np.ptp(image, axis=0).max()) / _MOST_ACROSS)
-    return size, int(np.ceil(sparse / size))
+    size = max(size, sparse / _WIDEST_GAP, float(np.ptp(image, axis=0).max()) / _MOST_ACROSS)
+    return size, int(np.ceil(sparse / size)) | 1
