@@ -26,7 +26,7 @@ def view(rng, focal=120.0, center=(63.5, 47.5)) -> Observation:
     turn, up = rng.uniform(0, 2 * np.pi), rng.uniform(0.3, 0.8)
     pose = look_at((0.7 * np.cos(turn), 0.7 * np.sin(turn), up), (0, 0, 0.05))
     matrix = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1.0]])
-    ball = (rng.uniform(-0.2, 0.2, 2).tolist() + [0.05], 0.05)
+    ball = ([*rng.uniform(-0.2, 0.2, 2), 0.05], 0.05)
     depth, labels = Scene(spheres=[ball], boxes=BOXES, floor=-0.7).render(pose, matrix, SHAPE)
     row, column = rng.integers(5, 60), rng.integers(5, 80)
     depth[row : row + 25, column : column + 25] = 0.0
@@ -75,7 +75,7 @@ def bent(true):
 NO_PINHOLE = {
     "mirrored": lambda true: (true.point_image()[:, ::-1], true.camera_center),
     "a lens": bent,
-    "the camera is elsewhere": lambda t: (t.point_image(), t.camera_center + [0.1, 0.1, 0.1]),
+    "the camera is elsewhere": lambda t: (t.point_image(), t.camera_center + np.full(3, 0.1)),
     "mixed": lambda true: (
         np.random.default_rng(0).permutation(true.point_image().reshape(-1, 3)).reshape(*SHAPE, 3),
         true.camera_center,

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Cameras as files state them: our own, ROS, RealSense, Open3D, OpenCV, BOP, GraspNet."""
 
+import struct
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +32,10 @@ _LENS_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # What OpenCV, ROS, RealSense and others call the polynomial of `undistort`.
 _LENS_MODELS = ("plumb_bob", "rational_polynomial", "brown_conrady", "opencv", "radtan", "pinhole")
 MILLIMETRE = 0.001
-_MOST_BYTES = 2**18
+_MAT_HEADER, _MAT_MATRIX, _MAT_COMPRESSED = 128, 14, 15
+_MAT_TYPES = {**dict(enumerate(("<i1", "<u1", "<i2", "<u2", "<i4", "<u4", "<f4"), 1)),
+              9: "<f8", 12: "<i8", 13: "<u8"}  # fmt: skip
+_MOST_TEXT, _MOST_MAT = 2**14, 2**20  # bytes; YAML takes the square of that to read
 
 
 @dataclass(frozen=True)
@@ -52,13 +58,10 @@ def read_camera(path: Path) -> dict[str, Any]:
     """
     if path.suffix == ".json" or not path.is_file():
         return _files.read_json(path, ObservationError)
-    with _files.reading(path, "a readable camera file", ObservationError, _MOST_BYTES):
+    most = _MOST_MAT if path.suffix == ".mat" else _MOST_TEXT
+    with _files.reading(path, "a readable camera file", ObservationError, most):
         if path.suffix == ".mat":
-            from scipy.io import loadmat
-
-            names = ("intrinsic_matrix", "factor_depth")
-            content: Any = loadmat(path, variable_names=names)
-            return {name: content[name].tolist() for name in names if name in content}
+            return _matlab(path.read_bytes()[_MAT_HEADER:])
         import yaml  # type: ignore[import-untyped]
 
         text = path.read_text(encoding="utf-8")
@@ -68,6 +71,36 @@ def read_camera(path: Path) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise ObservationError(f"{path} holds a {type(content).__name__}; give keys and values")
         return content
+
+
+def _matlab(data: bytes) -> dict[str, Any]:
+    """Return the real matrices of a MAT 5 file without its header, by name.
+
+    `scipy.io.loadmat` reads beyond memory where a type is damaged, and the process dies.
+    """
+
+    def elements(data: bytes, align: int) -> Iterator[tuple[int, bytes]]:
+        at = 0
+        while at + 8 <= len(data):
+            kind, size = struct.unpack_from("<II", data, at)
+            if kind >> 16:  # both in one word, the content in the next
+                yield kind & 0xFFFF, data[at + 4 : at + 4 + min(kind >> 16, 4)]
+                size = 0
+            else:
+                yield kind, data[at + 8 : at + 8 + size]
+            at += 8 + size + -size % align
+
+    found: dict[str, Any] = {}
+    for kind, inner in elements(data, 1):
+        if kind == _MAT_COMPRESSED:
+            whole = zlib.decompressobj().decompress(inner, _MOST_MAT)
+            kind, inner = next(elements(whole, 1), (0, b""))  # noqa: PLW2901
+        parts = list(elements(inner, 8)) if kind == _MAT_MATRIX else []
+        if len(parts) == 4 and parts[3][0] in _MAT_TYPES:  # flags, size, name, numbers
+            values = np.frombuffer(parts[3][1], _MAT_TYPES[parts[3][0]])
+            shape = np.frombuffer(parts[1][1], "<i4")
+            found[parts[2][1].decode()] = values.reshape(shape, order="F").tolist()
+    return found
 
 
 def camera_of(content: dict[str, Any], what: str, unit: float = 1.0) -> CameraFile:
