@@ -111,6 +111,7 @@ def test_colours_are_ids_whatever_else_is_in_the_image():
 
 
 def test_background_ids_are_no_objects():
+    assert label_image(IDS, SHAPE, 1)[0].max() == 2
     view = Observation(np.ones(SHAPE), STACK, np.diag([9.0, 9.0, 1.0]), background_ids=[1])
     np.testing.assert_array_equal(view.labels, np.where(SMALL, 2, 0))
     # What was named once is not taken again.

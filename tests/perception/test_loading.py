@@ -327,9 +327,17 @@ def test_files_that_were_not_used_are_named(folder):
     np.save(folder / "labels.npy", np.ones(SHAPE, int))
     (folder / "camera_info.yaml").write_text("width: 3")
     (folder / "notes.txt").write_text("x")
+    write(folder / "frame0-depth.png", raw_depth())  # another view's
     write(folder / "color.png", np.ones((*SHAPE, 3), np.uint8))
     (warning,) = load_observation(folder).warnings
     assert warning == f"not used: camera_info.yaml, labels.npy in {folder}; was it meant to be?"
+
+
+def test_arrays_that_were_not_used_are_named(tmp_path):
+    arrays = {"depth": np.ones(SHAPE), "K": K, "masks_raw": np.ones(3), "note": np.ones(2)}
+    np.savez(tmp_path / "view.npz", **arrays)
+    (warning,) = load_observation(tmp_path / "view.npz").warnings
+    assert "not used: masks_raw in" in warning
 
 
 def test_a_view_names_what_is_its_own_only(folder):

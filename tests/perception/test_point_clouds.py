@@ -93,6 +93,14 @@ def test_a_grid_that_is_no_image_is_named_and_taken_as_a_cloud(name):
     np.testing.assert_array_equal(seen.depth, same.depth)
 
 
+@pytest.mark.parametrize("given", ["pose", "camera_center"])
+def test_points_in_the_cameras_frame_are_no_points_in_the_worlds(given):
+    true = view(np.random.default_rng(2))
+    local = backproject(true.depth, true.intrinsics)
+    with pytest.raises(ObservationError, match="points are in the camera's own frame"):
+        Observation.from_points(local, None, getattr(true, given))
+
+
 # -------------------------------------------------------------------------------- unorganised
 def keep_all(image, rng):
     return np.ones(SHAPE, bool)

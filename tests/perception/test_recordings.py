@@ -120,6 +120,20 @@ def test_pixels_are_read_as_they_lie(view, tmp_path):
     np.testing.assert_allclose(seen.depth, view.depth)
 
 
+def saturated(bag, v):
+    bag.info("/camera_info", 5)
+    pixels = files.raw(v)
+    pixels[3, 4] = 65535
+    bag.depth("/depth", 5, pixels)
+
+
+def test_the_largest_raw_value_is_no_return(view, tmp_path):
+    seen = load_observation(files.mcap(view, tmp_path, saturated))
+    assert (seen.depth == 0).sum() == 1
+    assert seen.depth[3, 4] == 0.0
+    assert seen.warnings == ()
+
+
 def jumping(bag, v, times=(0, 4)):
     """TF stands still long before the image and after it."""
     for seconds in times:

@@ -31,7 +31,7 @@ def cameras_in(path: Path) -> list[Path]:
     return []
 
 
-def load_bop(cameras: list[Path], image: int | None, more: dict[str, Any]) -> Observation:
+def load_bop(cameras: list[Path], image: Any, more: dict[str, Any]) -> Observation:
     """Load one image of a scene; labels are the ground-truth index + 1.
 
     Args:

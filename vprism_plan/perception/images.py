@@ -26,12 +26,19 @@ UINT16_MAX = 65535
 
 def read_depth(path: Path) -> np.ndarray:
     """Return depth (H, W) as it is: raw sensor units, 0 also for "no data", or floats."""
+    return without_no_data(_read_depth(path))
+
+
+def _read_depth(path: Path) -> np.ndarray:
     if path.suffix == ".npy":
-        raw = read_array(path)
-    else:
-        remedy = "an 8-bit image has lost the metric depth: export the raw one"
-        wanted = f"depth must be a 16-bit or float single-channel PNG or TIFF ({remedy})"
-        raw = _read(path, _DEPTH_MODES, wanted)[0]
+        return read_array(path)
+    remedy = "an 8-bit image has lost the metric depth: export the raw one"
+    wanted = f"depth must be a 16-bit or float single-channel PNG or TIFF ({remedy})"
+    return _read(path, _DEPTH_MODES, wanted)[0]
+
+
+def without_no_data(raw: np.ndarray) -> np.ndarray:
+    """Return whole sensor units with 0 for the largest that they hold; floats as they are."""
     if raw.dtype.kind not in "iu" or not raw.size:
         return raw
     # 16 bits may arrive in a wider type.

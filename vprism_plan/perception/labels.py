@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Labels in the forms that segmentation hands over, turned into one image of object ids."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ _FORMS = (
 
 
 def label_image(
-    value: Any, shape: tuple[int, int], background_ids: Iterable[int] = ()
+    value: Any, shape: tuple[int, int], background_ids: Any = ()
 ) -> tuple[Ids, tuple[str, ...]]:
     """Return labels as an image of ids (H, W), 0 = background, and what is odd about them.
 
@@ -54,7 +54,8 @@ def label_image(
         labels, found = _painted(masks, shape)
     else:
         labels = _checked(array, shape)
-    if ids := [whole("background_ids", i, error=ObservationError) for i in background_ids]:
+    given = np.atleast_1d(np.array(background_ids, dtype=object))
+    if ids := [whole("background_ids", i, error=ObservationError) for i in given]:
         labels[np.isin(labels, ids)] = 0
     return labels, found
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One view of the scene: depth, labels and a known camera."""
 
-from collections.abc import Iterable
 from dataclasses import InitVar, dataclass
 from functools import cached_property
 from typing import Any
@@ -65,9 +64,9 @@ class Observation:
     robot_spheres: Any = None
     warnings: tuple[str, ...] = ()
     max_range: float = DEFAULT_MAX_RANGE
-    background_ids: InitVar[Iterable[int]] = ()
+    background_ids: InitVar[Any] = ()
 
-    def __post_init__(self, background_ids: Iterable[int]) -> None:
+    def __post_init__(self, background_ids: Any) -> None:
         max_range = number("max_range", self.max_range, 0.0, above=True, error=ObservationError)
         depth, found = check_depth(self.depth, max_range)
         checked: dict[str, Any] = {

@@ -53,6 +53,11 @@ def image_of(points: Any, labels: Any, camera: Any, intrinsics: Any) -> dict[str
         if off <= _OFF:
             turn = view.pop("turn")
             return {**view, "labels": labels, "warnings": found} | _placed(center, turn)
+        if center.any() and _organised(points, is_point, np.eye(3), known)[1] <= _OFF:
+            raise ObservationError(
+                f"the points are in the camera's own frame, not in that in which it is at "
+                f"{center.round(3)}: transform them, or give (0, 0, 0) and set T_world_camera after"
+            )
         found += (
             f"the (H, W, 3) points miss the pixels of a pinhole camera at {center.round(3)} by "
             f"{off:.3g} pixels rms, more than {_OFF:g}, and are taken as (N, 3): is "
@@ -100,6 +105,8 @@ def _organised(
     some = slice(None, None, max(1, len(rows) // _SAMPLE))
     pixels = np.stack([columns[some], rows[some]], axis=1).astype(np.float64)
     seen = points[rows[some], columns[some]]
+    if turn is not None and not (seen @ turn[:, 2] > 0).all():
+        return {}, np.inf
     try:
         if intrinsics is None:
             intrinsics = _intrinsics(seen, pixels, turn)

@@ -18,7 +18,6 @@ from vprism_plan.errors import ObservationError
 from vprism_plan.perception.bop import cameras_in, load_bop
 from vprism_plan.perception.camera_files import (
     NAMES,
-    CameraFile,
     camera_of,
     check_size,
     matrix,
@@ -33,6 +32,7 @@ from vprism_plan.perception.images import (
     read_depth,
     read_labels,
     straight,
+    without_no_data,
 )
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.recordings import is_recording, load_recording
@@ -54,9 +54,8 @@ _IMAGES, _LABEL_FILES = (".png", ".tif", ".tiff"), (".png", ".tif", ".tiff", ".n
 _DEPTH_FILES, _CLOUDS = (*_IMAGES, ".npy"), (".pcd", ".ply", ".npy")
 # A file of these words and types is meant for a reader: if it was not used, that is said.
 _MEANT = ("depth", "label", "mask", "seg", "camera", "intrinsic", "extrinsic", "pose", "calib",
-          "points", "xyz", "cloud")  # fmt: skip
+          "points", "xyz", "cloud", "instance")  # fmt: skip
 _MEANT_TYPES = (*_LABEL_FILES, *_CLOUDS, ".npz", ".yaml", ".yml", ".mat", ".txt", ".exr", ".jpg")
-_MANY_LEFT = 20
 _FORMS = (
     "a .npz file, a folder with depth.png and camera.json, a BOP scene folder with "
     "scene_camera.json, a depth image named *depth.png with camera.json beside it, a point cloud "
@@ -115,11 +114,9 @@ def load_observation(
     with _files.reading(source, "a readable observation", ObservationError):
         try:
             if recording:
-                return load_recording(
-                    source, depth, None if frame is None else str(frame), at, more
-                )
+                return load_recording(source, depth, frame, at, more)
             if bop:
-                return load_bop(bop, frame if isinstance(frame, int) else None, more)
+                return load_bop(bop, frame, more)
             if source.is_dir():
                 return _load_folder(source, more)
             if source.suffix == ".npz":
@@ -209,10 +206,15 @@ def _load_files(main: Path, prefix: str, cloud: bool, more: dict[str, Any]) -> O
         "T_world_camera": camera.pose if pose is None else _read_pose(pose),
         **camera.rest,
         **more,
-        "warnings": _unused(folder, prefix, used),
     }
+    left = (path.name for path in folder.iterdir() if path not in used)
+    own = (name for name in left if name.startswith(prefix) and name.endswith(_MEANT_TYPES))
+    given["warnings"] = _unused(own, prefix, folder)
     if cloud:
-        return _load_cloud(main, given, camera)
+        points, own_labels, position = read_cloud(main)
+        given["labels"] = own_labels if labels is None else given["labels"]
+        position = position if camera.position is None else camera.position
+        return _cloud(points, position, camera.intrinsics, given)
     if camera.intrinsics is None:
         raise ObservationError(f"{camera_path}: 'fx' is missing; give fx, fy, cx, cy or K (3x3)")
     raw = read_depth(main)
@@ -233,31 +235,13 @@ def _read_pose(path: Path) -> np.ndarray:
     return matrix(value, (4, 4), str(path))
 
 
-def _unused(folder: Path, prefix: str, used: set[Path]) -> tuple[str, ...]:
-    """Name files that look like parts of a view and were not read."""
-    left = sorted(
-        path.name
-        for path in folder.iterdir()
-        if path not in used
-        and path.name.startswith(prefix)
-        and path.suffix.lower() in _MEANT_TYPES
-        and any(word in path.stem.lower() for word in _MEANT)
-    )
-    if not left or len(left) > _MANY_LEFT:  # many: the folder is of many views
-        return ()
-    return (f"not used: {', '.join(left)} in {folder}; was it meant to be?",)
+def _unused(names: Iterable[str], prefix: str, place: Path) -> tuple[str, ...]:
+    """Name files or arrays that were not read, of those that look like parts of a view."""
+    left = sorted(name for name in names if name.removeprefix(prefix).lower().startswith(_MEANT))
+    return (f"not used: {', '.join(left)} in {place}; was it meant to be?",) if left else ()
 
 
 # ------------------------------------------------------------------------------------- clouds
-def _load_cloud(path: Path, given: dict[str, Any], camera: CameraFile) -> Observation:
-    points, labels, position = read_cloud(path)
-    if given["labels"] is None:
-        given["labels"] = labels
-    if camera.position is not None:
-        position = camera.position
-    return _cloud(points, position, camera.intrinsics, given)
-
-
 def _cloud(
     points: np.ndarray, position: Any, intrinsics: Any, given: dict[str, Any]
 ) -> Observation:
@@ -296,6 +280,7 @@ def _load_npz(path: Path, more: dict[str, Any]) -> Observation:
             raise ObservationError(f"{path} unpacks to {unpacked:,} bytes; {most}")
         content = {key: archive[key] for key in known if key in archive.files}
         found = ", ".join(archive.files) or "nothing"
+        unused = _unused((name for name in archive.files if name not in known), "", path)
     for key, names in _ALIASES.items():
         values = [content.pop(name) for name in names if name in content]
         content |= {key: values[0]} if values else {}
@@ -310,11 +295,13 @@ def _load_npz(path: Path, more: dict[str, Any]) -> Observation:
         stated["max_range"] = float(matrix(stated["max_range"], (), "max_range"))
     content |= camera_of(stated, str(path)).rest | {"robot_spheres": content.get("robot_spheres")}
     position, scale = content.pop("camera_position", None), content.pop("depth_scale", None)
-    content = {"labels": None, **content, **more, "warnings": ()}
-    if points is not None and "depth" not in content:
+    content = {"labels": None, **content, **more, "warnings": unused}
+    if points is not None and not {"depth", "intrinsics"} <= content.keys():
+        content.pop("depth", None)
         return _cloud(points, position, content.pop("intrinsics", None), content)
     if scale is not None:
-        content["depth"] = content["depth"] * float(matrix(scale, (), "depth_scale"))
+        scale = float(matrix(scale, (), "depth_scale"))
+        content["depth"] = without_no_data(content["depth"]) * scale
     content["intrinsics"] = matrix(content["intrinsics"], (3, 3), "intrinsics")
     return Observation(**content)
 

@@ -16,7 +16,7 @@ from vprism_plan._shapes import Pose
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import invert_transform
 from vprism_plan.perception.camera_files import MILLIMETRE, camera_of, check_size
-from vprism_plan.perception.images import straight
+from vprism_plan.perception.images import straight, without_no_data
 from vprism_plan.perception.observation import Observation
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -38,7 +38,7 @@ def is_recording(path: Path) -> bool:
 def load_recording(
     path: Path,
     depth: str | None = None,
-    frame: str | None = None,
+    frame: int | str | None = None,
     at: float | None = None,
     more: dict[str, Any] | None = None,
 ) -> Observation:
@@ -58,11 +58,8 @@ def load_recording(
         ObservationError: what is missing; topics or frames that there are.
         MissingDependencyError: `rosbags`, which the extra `formats` brings, is not installed.
     """
-    bags = _files.optional(
-        "rosbags.rosbag1" if path.suffix == ".bag" else "rosbags.rosbag2",
-        "formats",
-        "recordings need",
-    )
+    version = 1 if path.suffix == ".bag" else 2
+    bags = _files.optional(f"rosbags.rosbag{version}", "formats", "recordings need")
     with _files.reading(path, "a readable recording", ObservationError), bags.Reader(path) as bag:
         return _Recording(path, bag).view(depth, frame, at, more or {})
 
@@ -83,12 +80,12 @@ class _Recording:
         self.read = store.deserialize_ros1 if one else store.deserialize_cdr
 
     def view(
-        self, depth: str | None, frame: str | None, at: float | None, more: dict[str, Any]
+        self, depth: str | None, frame: int | str | None, at: float | None, more: dict[str, Any]
     ) -> Observation:
         topic = self._depth_topic(depth)
         when = None if at is None else number("at", at, 0.0, unit="s", error=ObservationError)
         recorded, message = self._nearest(topic, when)
-        raw = _pixels(message, topic)
+        raw = without_no_data(_pixels(message, topic))
         info_topic = self._info_topic(topic, message.header.frame_id)
         _, info = self._nearest(info_topic, None)
         content = {
@@ -106,9 +103,7 @@ class _Recording:
             "warnings": (),
         }
         if frame is not None:
-            stamp = message.header.stamp
-            seconds = stamp.sec + 1e-9 * stamp.nanosec
-            given["T_world_camera"] = self._pose(frame, message.header.frame_id, seconds, recorded)
+            given["T_world_camera"] = self._pose(str(frame), message.header, recorded)
         return straight(given | more, camera)
 
     def _messages(self, *topics: str, **when: int) -> Iterator[tuple[str, int, Any]]:
@@ -185,8 +180,9 @@ class _Recording:
         return MILLIMETRE
 
     # ------------------------------------------------------------------------------------- TF
-    def _pose(self, world: str, camera: str, time: float, recorded: int) -> Pose:
-        """Return the pose of the camera's frame in another at a time (s), recorded at (ns)."""
+    def _pose(self, world: str, header: Any, recorded: int) -> Pose:
+        """Return the pose of an image's frame in another at its time; it was recorded at (ns)."""
+        camera, time = header.frame_id, _seconds(header)
         moves: dict[str, list[tuple[float, str, Pose]]] = defaultdict(list)
         fixed: dict[str, tuple[str, Pose]] = {}
         near = {"start": recorded - _TF_NEAR, "stop": recorded + _TF_NEAR}
@@ -195,11 +191,10 @@ class _Recording:
         for topic, _, message in chain(self._messages(*static), self._messages(*moving, **near)):
             for item in message.transforms:
                 parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
-                stamp = item.header.stamp.sec + 1e-9 * item.header.stamp.nanosec
                 if topic in static:
                     fixed[child] = parent, _transform(item.transform)
                 else:
-                    moves[child].append((stamp, parent, _transform(item.transform)))
+                    moves[child].append((_seconds(item.header), parent, _transform(item.transform)))
 
         def upwards(child: str) -> Iterator[tuple[str, Pose]]:
             """Yield a frame, and those above it, with the pose of `child` in each."""
@@ -251,6 +246,10 @@ def _between(child: str, moves: list[tuple[float, str, Pose]], time: float) -> t
     turns = Rotation.from_matrix(np.stack([first[:3, :3], last[:3, :3]]))
     pose[:3, :3] = Slerp([0.0, 1.0], turns)(share).as_matrix()
     return parent, pose
+
+
+def _seconds(header: Any) -> float:
+    return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
 
 
 def _transform(message: Any) -> Pose:
