@@ -102,14 +102,11 @@ class Observation:
         """Return the view that a point cloud is, as its camera saw it.
 
         Args:
-            points: metres; NaN and (0, 0, 0) are no points.
-                - (H, W, 3), organised: one point per pixel. Intrinsics, and the turn of the
-                  camera, are recovered from the grid; if it is no pinhole image, a warning
-                  says so and it is taken for
-                - (N, 3), unorganised: looked at from `camera_position` in an image whose
-                  pixels hold a point each where points are dense, and no holes where they are
-                  sparse. A pixel has the nearest of its points, so that what the cloud
-                  shows through an object stays hidden.
+            points: metres; NaN and (0, 0, 0) are no points. (H, W, 3), organised, is one point per
+                pixel: intrinsics, and the turn of the camera, are recovered from the grid; if it
+                is no pinhole image, a warning says so and it is taken as unorganised. (N, 3),
+                unorganised, is looked at from `camera_position` in an image in which surfaces
+                have no holes. A pixel has the nearest of its points.
             labels: for (H, W, 3) what `labels` may be, for (N, 3) ids (N,); None = not segmented.
             camera_position: (3,) in the frame of the points, metres, or (4, 4), the pose of the
                 optical frame in it. That frame is the view's world, z up. Only if the camera is at
