@@ -91,6 +91,9 @@ def test_a_grid_that_is_no_image_is_named_and_taken_as_a_cloud(name):
     flat = points.reshape(-1, 3)
     same = Observation.from_points(flat, None, camera)
     np.testing.assert_array_equal(seen.depth, same.depth)
+    known = intrinsics(128, 96).tolist()
+    same = Observation.from_points(points, None, camera, known)
+    assert "are taken as (N, 3)" in same.warnings[0]
 
 
 @pytest.mark.parametrize("given", ["pose", "camera_center"])
@@ -188,6 +191,15 @@ def test_nearest_points_win_and_what_lies_behind_is_named():
     assert seen.object_ids == (1,)
     assert "40 % of the points lie more than 5 cm behind others" in seen.warnings[0]
     assert not seen.posed
+
+
+@pytest.mark.parametrize("known", [None, np.diag([1e9, 1e9, 1.0])])
+def test_an_image_stays_small_however_narrow_and_far_off_the_axis_a_cloud_is(known):
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(2.5, 2.501, (500, 2)), np.ones(500)])
+    seen = Observation.from_points(points, None, (0, 0, 0), known)
+    assert max(seen.shape) < 2100
+    assert (seen.depth > 0).any()
 
 
 def test_points_to_the_side_are_named():

@@ -24,7 +24,7 @@ NAMES = (
     "camera_info.json", "intrinsics.json", "intrinsics.yaml", "intrinsic.json",
     "camera_intrinsic.json", "meta.mat",
 )  # fmt: skip
-_MATRICES = (
+MATRICES = (
     "intrinsics", "intrinsic_matrix", "camera_matrix", "cam_K", "K", "k", "camera_intrinsics",
 )  # fmt: skip
 _LENS_KEYS = ("distortion", "D", "d", "coeffs", "dist_coeffs", "distortion_coefficients")
@@ -158,7 +158,7 @@ def check_size(content: dict[str, Any], shape: tuple[int, ...], what: str) -> No
 
 
 def _intrinsics(content: dict[str, Any], what: str) -> Matrix | None:
-    key = next((name for name in _MATRICES if content.get(name) is not None), None)
+    key = next((name for name in MATRICES if content.get(name) is not None), None)
     if key is not None:
         value = content[key]
         value = value.get("data") if isinstance(value, dict) else value

@@ -47,8 +47,10 @@ def image_of(points: Any, labels: Any, camera: Any, intrinsics: Any) -> dict[str
         value = labels if shape[1] > 1 else to_numpy(labels, "labels").reshape(-1, 1)
         labels, found = label_image(value, shape)
     center, turn = _camera(camera, points[is_point])
+    known = None
+    if intrinsics is not None:
+        known = check_intrinsics(intrinsics, shape if min(shape) > 1 else (2**31, 2**31))
     if min(shape) > 1:
-        known = None if intrinsics is None else check_intrinsics(intrinsics, shape)
         view, off = _organised(points - center, is_point, turn, known)
         if off <= _OFF:
             turn = view.pop("turn")
@@ -63,10 +65,8 @@ def image_of(points: Any, labels: Any, camera: Any, intrinsics: Any) -> dict[str
             f"{off:.3g} pixels rms, more than {_OFF:g}, and are taken as (N, 3): is "
             "camera_position in the frame of the points?",
         )
-    elif intrinsics is not None:
-        intrinsics = check_intrinsics(intrinsics, (2**31, 2**31))
     own = None if labels is None else labels[is_point]
-    view = _unorganised(points[is_point] - center, own, turn, intrinsics)
+    view = _unorganised(points[is_point] - center, own, turn, known)
     turn = view.pop("turn")
     return {**view, "warnings": found + view["warnings"]} | _placed(center, turn)
 
@@ -235,5 +235,6 @@ def _pixel_size(image: np.ndarray, intrinsics: Matrix | None) -> tuple[float, in
     # To the eighth neighbour it is 1.4 spacings on a square lattice, 1.6 at random.
     sparse = 1.1 * float(np.percentile(gap, _SPARSE))
     size = 0.75 * float(np.median(gap)) if intrinsics is None else 1.0 / intrinsics[0, 0]
-    size = max(size, sparse / _WIDEST_GAP, float(np.ptp(image, axis=0).max()) / _MOST_ACROSS)
+    across = float((np.maximum(image.max(axis=0), 0.0) - np.minimum(image.min(axis=0), 0.0)).max())
+    size = max(size, sparse / _WIDEST_GAP, across / _MOST_ACROSS)  # the axis is in the image
     return size, int(np.ceil(sparse / size)) | 1

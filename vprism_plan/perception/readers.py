@@ -17,6 +17,7 @@ from vprism_plan import _files
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.bop import cameras_in, load_bop
 from vprism_plan.perception.camera_files import (
+    MATRICES,
     NAMES,
     camera_of,
     check_size,
@@ -46,7 +47,6 @@ _LABELS = ("labels", "label", "masks", "mask", "segmentation", "segmap", "seg", 
 _ALIASES = {
     "points": ("points", "xyz", "point_cloud", "pc"),
     "labels": _LABELS,
-    "intrinsics": ("intrinsics", "K", "cam_K", "intrinsic_matrix", "camera_matrix"),
     "color": ("color", "rgb"),
 }
 _POINTS = ("points", "xyz", "cloud", "point_cloud")
@@ -78,18 +78,14 @@ def load_observation(
       `T_world_camera`, `color`, `plane` (normal and offset), `robot_spheres` (rows x, y, z,
       radius; camera frame), `max_range` (metres).
     - a folder: `depth.png` (also .tif, .npy; 16-bit, or float metres) and `camera.json` with
-      `fx fy cx cy` (pixels) and `depth_scale` (metres per raw unit), optional `T_world_camera`
-      (4x4), `plane`, `robot_spheres` and `max_range`; optional `labels.*`, `color.png` and
-      `pose.txt` (4x4, camera to world). ROS's, Open3D's, OpenCV's and GraspNet's camera files
-      do as well. A lens's `distortion` (OpenCV's k1 k2 p1 p2 k3, or 8 numbers) is undone by
-      nearest pixel.
-    - a depth image `X-depth.png`: `camera.json` beside it, optional `X-color.png`, `X-labels.*`,
-      `X-pose.txt`.
-    - a point cloud, `.pcd`, `.ply`, `.npy` (`X-points.npy`, or in a folder `points.*`): labels
-      are its field `label`, or a file beside it; where the camera was is said by the file, or by
-      `camera_position` or `T_world_camera` in `camera.json` beside it.
-    - BOP data (`scene_camera.json`, `depth/`, millimetres): `frame` picks the image, default
-      the first; labels are the ground-truth index + 1 from `mask_visib/`.
+      `fx fy cx cy` (pixels) and `depth_scale` (metres per raw unit), optional keys as above;
+      or ROS's, Open3D's, OpenCV's, GraspNet's camera file. Optional `labels.*`, `color.png`,
+      `pose.txt` (4x4, camera to world). OpenCV's lens distortion is undone by nearest pixel.
+    - `X-depth.png`, with `X-labels.*` and so on, and `camera.json` beside it.
+    - `.pcd`, `.ply`, `.npy` with points (in a folder `points.*`): labels are a field or a file
+      beside it; so is where the camera was (`camera_position` or `T_world_camera`).
+    - BOP data, millimetres: `frame` picks the image, default the first; labels are the
+      ground-truth index + 1.
     - a recording, ROS 1 or 2, MCAP or RealSense: see `recordings.load_recording`; `depth` is the
       topic, `at` the time in seconds from its start, `frame` the TF frame that is the world.
 
@@ -263,7 +259,7 @@ def _cloud(
 
 # --------------------------------------------------------------------------------------- .npz
 def _load_npz(path: Path, more: dict[str, Any]) -> Observation:
-    known = (*_SAVED, "camera_position", "depth_scale", *sum(_ALIASES.values(), ()))
+    known = (*_SAVED, "camera_position", "depth_scale", *MATRICES, *sum(_ALIASES.values(), ()))
     with (
         _files.reading(path, "a readable .npz without pickle", ObservationError),
         path.open("rb") as stream,  # numpy leaves a damaged file open
@@ -281,29 +277,22 @@ def _load_npz(path: Path, more: dict[str, Any]) -> Observation:
         content = {key: archive[key] for key in known if key in archive.files}
         found = ", ".join(archive.files) or "nothing"
         unused = _unused((name for name in archive.files if name not in known), "", path)
-    for key, names in _ALIASES.items():
-        values = [content.pop(name) for name in names if name in content]
-        content |= {key: values[0]} if values else {}
-    points = content.pop("points", None)
-    for key in ("depth", "intrinsics") if points is None else ():
-        if key not in content:
+    arrays = {
+        key: next((content[name] for name in names if name in content), None)
+        for key, names in _ALIASES.items()
+    }
+    points, depth = arrays.pop("points"), content.pop("depth", None)
+    camera = camera_of(content, str(path))
+    given = {**arrays, "T_world_camera": camera.pose, **camera.rest, **more, "warnings": unused}
+    if points is not None and (depth is None or camera.intrinsics is None):
+        return _cloud(points, camera.position, camera.intrinsics, given)
+    for key, value in (("depth", depth), ("intrinsics", camera.intrinsics)):
+        if value is None:
             wanted = "an observation needs depth (metres) and intrinsics (3x3), or points"
             raise ObservationError(f"has no {key!r} (found: {found}); {wanted}")
-    stated: dict[str, Any] = {}
-    stated |= {key: content.pop(key) for key in ("plane", "max_range") if key in content}
-    if "max_range" in stated:
-        stated["max_range"] = float(matrix(stated["max_range"], (), "max_range"))
-    content |= camera_of(stated, str(path)).rest | {"robot_spheres": content.get("robot_spheres")}
-    position, scale = content.pop("camera_position", None), content.pop("depth_scale", None)
-    content = {"labels": None, **content, **more, "warnings": unused}
-    if points is not None and not {"depth", "intrinsics"} <= content.keys():
-        content.pop("depth", None)
-        return _cloud(points, position, content.pop("intrinsics", None), content)
-    if scale is not None:
-        scale = float(matrix(scale, (), "depth_scale"))
-        content["depth"] = without_no_data(content["depth"]) * scale
-    content["intrinsics"] = matrix(content["intrinsics"], (3, 3), "intrinsics")
-    return Observation(**content)
+    if camera.depth_scale is not None:
+        depth = without_no_data(np.asarray(depth)) * camera.depth_scale
+    return straight(given | {"depth": depth}, camera)
 
 
 # ------------------------------------------------------------------------------------- saving
