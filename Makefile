@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
-EXTRAS ?= dev,experiments,docs,viewer
+EXTRAS ?= dev,experiments,docs,viewer,formats
 STAMP := $(VENV)/.installed
 
 .PHONY: demo test test-all lint types docs bench clean

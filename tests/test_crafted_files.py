@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from oracles import view_files
 from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import save_file
@@ -170,6 +171,11 @@ def kinds(tmp_path_factory) -> dict[str, Kind]:
     def spheres(name: str, content: str) -> Kind:
         return Kind(text(root / name, content), lambda: read_spheres(root / name))
 
+    def view(name: str, write: Any, part: str = "") -> Kind:
+        (root / name).mkdir()
+        path = write(obs, root / name)
+        return Kind(path / part if part else path, lambda: load_observation(path))
+
     return {
         "npz": Kind(root / "view.npz", lambda: load_observation(root / "view.npz")),
         "camera": Kind(seen / "camera.json", lambda: load_observation(seen)),
@@ -188,13 +194,23 @@ def kinds(tmp_path_factory) -> dict[str, Kind]:
             text(root / "t.json", json.dumps(TRAJECTORY)),
             lambda: read_trajectory(root / "t.json"),
         ),
+        "pcd": view("pcd", lambda v, r: view_files.pcd(v, r, *v.points())),
+        "ply points": view("ply points", view_files.ply),
+        "npy points": view("npy points", view_files.xyz_and_mask_images),
+        "masks": view("masks", view_files.coco, "labels.json"),
+        "yaml": view("yaml", view_files.calibration_yaml, "camera.yaml"),
+        "mat": view("mat", view_files.graspnet, "meta.mat"),
+        "mcap": view("mcap", lambda v, r: view_files.mcap(v, r, view_files.one_image)),
+        "sqlite": view("sqlite", lambda v, r: view_files.sqlite(v, r, view_files.one_image)),
+        "bag": view("bag", lambda v, r: view_files.bag1(v, r, view_files.one_image)),
         **{name: mesh(f"ball.{name}") for name in ("stl", "obj", "ply", "off", "dae", "glb")},
     }  # fmt: skip
 
 
 NAMES = (
     "npz", "camera", "png", "labels", "bop", "map", "urdf", "srdf", "spheres", "curobo", "xrdf",
-    "trajectory", "stl", "obj", "ply", "off", "dae", "glb",
+    "trajectory", "stl", "obj", "ply", "off", "dae", "glb", "pcd", "ply points", "npy points",
+    "masks", "yaml", "mat", "mcap", "sqlite", "bag",
 )  # fmt: skip
 
 
@@ -290,7 +306,7 @@ def changed(value: Any, odd: tuple[Any, ...] = ODD) -> Any:
         yield from ([other, *value[1:]] for other in changed(value[0], odd))
 
 
-@pytest.mark.parametrize("name", ["camera", "bop", "trajectory"])
+@pytest.mark.parametrize("name", ["camera", "bop", "trajectory", "masks"])
 def test_every_value_of_a_json_file_may_be_of_any_kind(kinds, name):
     whole = json.loads(kinds[name].part.read_text())
     for content in changed(whole):
@@ -405,6 +421,29 @@ MADE = {
         json.dumps(TRAJECTORY).replace('"sec": 1', '"sec": "xxxx"').encode(),
     ),
     "aliases of aliases": ("spheres", f"{ALIASES}collision_spheres: {{hand: *i}}".encode()),
+    "aliases in a camera": ("yaml", f"{ALIASES}K: *i".encode()),
+    "deep yaml of a camera": ("yaml", b"[" * DEEP),
+    "a python object for a camera": ("yaml", b"K: !!python/object/apply:os.getcwd []"),
+    "masks of a terabyte": ("masks", b'[{"size": [1000000, 1000000], "counts": "0"}]'),
+    "masks that end early": ("masks", b'[{"size": [12, 16], "counts": "01"}]'),
+    "runs that end early": ("masks", b'[{"size": [12, 16], "counts": [5, 3]}]'),
+    "runs below zero": ("masks", b'[{"size": [12, 16], "counts": [5, -3, 190]}]'),
+    "deep masks": ("masks", b"[" * DEEP),
+    "a terabyte of points": (
+        "npy points", npy_of(np.ones((4, 3)), "(999999999, 3)")
+    ),
+    "points of nothing": ("npy points", npy_of(np.ones((0, 3)))),
+    "billions of points": (
+        "pcd",
+        b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 99999999999\n"
+        b"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 99999999999\nDATA binary\n\x00\x00",
+    ),
+    "billions of packed points": (
+        "pcd",
+        b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 999999999\n"
+        b"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 999999999\nDATA binary_compressed\n"
+        b"\x08\x00\x00\x00\xff\xff\xff\xffabcdefgh",
+    ),
     "aliases as names": ("spheres", f"{ALIASES}? *i\n: 1".encode()),
     "an alias in itself": ("spheres", b"collision_spheres: &a {hand: *a}"),
     "deep yaml": ("spheres", b"[" * DEEP),

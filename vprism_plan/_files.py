@@ -6,10 +6,12 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from vprism_plan.errors import VPrismError
+from vprism_plan.errors import MissingDependencyError, VPrismError
 
 _LONGEST = 1000  # characters of a message about a file
 MOST_TEXT = 2**25  # bytes of a text that is read: 32 MiB
@@ -101,3 +103,18 @@ def read_json(path: Path, error: type[VPrismError]) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise error(f"{path} holds a {type(content).__name__}; it must be an object")
         return content
+
+
+def optional(module: str, extra: str, needs: str) -> ModuleType:
+    """Import a module that an extra of this package brings.
+
+    Raises:
+        MissingDependencyError: `needs` ("recordings need"), the package and how to install it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise MissingDependencyError(
+            f"{needs} {name}, which is not installed: pip install 'vprism_plan[{extra}]'"
+        ) from error

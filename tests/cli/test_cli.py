@@ -49,7 +49,7 @@ BROKEN = {
     "missing file": ("absent.npz", {}, "absent.npz"),
     "wrong shape": ("a.npz", {"depth": lambda d: d[0]}, "depth"),
     "labels of another shape": ("b.npz", {"labels": lambda x: x[:-1]}, "labels"),
-    "negative depth": ("c.npz", {"depth": lambda d: np.where(d > 1.0, -np.inf, d)}, "inf"),
+    "negative depth": ("c.npz", {"depth": lambda d: np.where(d > 1.0, -0.5, d)}, "negative"),
     "labels without objects": ("d.npz", {"labels": lambda x: 0 * x}, "object"),
     "singular intrinsics": ("e.npz", {"intrinsics": lambda k: 0 * k}, "intrinsics"),
     "pose that is not rigid": ("f.npz", {"T_world_camera": lambda t: 2 * t}, "T_world_camera|pose"),

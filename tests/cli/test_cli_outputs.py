@@ -99,7 +99,7 @@ def test_an_interrupt_is_not_an_answer(monkeypatch, capsys, tmp_path):
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_maps, "fit_view", interrupted)
+    monkeypatch.setattr(_maps, "fit_views", interrupted)
     assert main(["map", "x.npz", "--output", str(tmp_path / "m.safetensors")]) == 130
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
@@ -111,7 +111,7 @@ def test_a_defect_is_neither_an_answer_nor_bad_input(monkeypatch, capsys):
     def broken(*_args, **_kwargs):
         raise AssertionError("defect")
 
-    monkeypatch.setattr(_maps, "fit_view", broken)
+    monkeypatch.setattr(_maps, "fit_views", broken)
     assert main(["map", "x.npz"]) == 3
     assert "Traceback" in capsys.readouterr().err
 

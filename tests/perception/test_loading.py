@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from oracles.perception_oracles import intrinsics, look_at
 from PIL import Image
 
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import Observation, Plane, load_observation, save_observation
 from vprism_plan.perception.camera import invert_transform
+from vprism_plan.perception.readers import views_in
 
 SHAPE = (12, 16)
 K = intrinsics(16, 12)
@@ -254,9 +256,9 @@ FOLDER_FAULTS = {
         lambda f: write(f / "labels.png", np.ones((3, 3), np.uint8)),
         r"labels have shape \(3, 3\)",
     ),
-    "labels color": (
-        lambda f: write(f / "labels.png", np.ones((*SHAPE, 3), np.uint8)),
-        "single-channel",
+    "labels with alpha": (
+        lambda f: write(f / "labels.png", np.ones((*SHAPE, 2), np.uint8)),
+        "pixel format LA.*object ids",
     ),
     "color depth 16": (lambda f: write(f / "color.png", raw_depth()), "8-bit RGB"),
 }
@@ -320,6 +322,129 @@ def test_unknown_paths_are_explained(tmp_path):
         load_observation(tmp_path / "notes.txt")
 
 
+def test_files_that_were_not_used_are_named(folder):
+    write(folder / "labels.png", np.ones(SHAPE, np.uint8))
+    np.save(folder / "labels.npy", np.ones(SHAPE, int))
+    (folder / "camera_info.yaml").write_text("width: 3")
+    (folder / "notes.txt").write_text("x")
+    write(folder / "frame0-depth.png", raw_depth())  # another view's
+    write(folder / "color.png", np.ones((*SHAPE, 3), np.uint8))
+    (warning,) = load_observation(folder).warnings
+    assert warning == f"not used: camera_info.yaml, labels.npy in {folder}; was it meant to be?"
+
+
+def test_arrays_that_were_not_used_are_named(tmp_path):
+    arrays = {"depth": np.ones(SHAPE), "K": K, "masks_raw": np.ones(3), "note": np.ones(2)}
+    np.savez(tmp_path / "view.npz", **arrays)
+    (warning,) = load_observation(tmp_path / "view.npz").warnings
+    assert "not used: masks_raw in" in warning
+
+
+def test_a_view_names_what_is_its_own_only(folder):
+    for name in ("a-depth.png", "a-labels.png", "a-mask.png", "b-depth.png", "b-labels.png"):
+        write(folder / name, raw_depth())
+    (warning,) = load_observation(folder / "a-depth.png").warnings
+    assert "not used: a-mask.png in" in warning
+
+
+def test_a_folder_of_views(obs, tmp_path):
+    save_observation(obs, tmp_path / "one")
+    save_observation(obs, tmp_path / "two.npz")
+    (tmp_path / "notes").mkdir()
+    assert views_in(tmp_path) == [tmp_path / "one", tmp_path / "two.npz"]
+    assert views_in(tmp_path / "one") == [tmp_path / "one"]
+    with pytest.raises(ObservationError, match=r"it holds 2 views, give one: one, two\.npz"):
+        load_observation(tmp_path)
+    (tmp_path / "two.npz").unlink()
+    assert_same(load_observation(tmp_path), obs, 0.5001e-4)
+
+
+def test_images_with_poses_are_a_folder_of_views(folder):
+    (folder / "depth.png").unlink()
+    for name in ("a.", "b-"):
+        write(folder / f"{name}depth.png", raw_depth())
+        np.save(folder / f"{name}labels.npy", np.ones(SHAPE, int))
+        np.save(folder / f"{name}pose.npy", look_at((0.5, 0.2, 0.7)))
+    np.save(folder / "c-points.npy", np.ones((100, 3)))
+    found = views_in(folder)
+    assert [path.name for path in found] == ["a.depth.png", "b-depth.png", "c-points.npy"]
+    for path in found[:2]:
+        view = load_observation(path)
+        assert view.object_ids == (1,)
+        np.testing.assert_allclose(view.pose, look_at((0.5, 0.2, 0.7)))
+
+
+def test_background_ids_are_asked_of_any_form(scene, folder):
+    write(folder / "depth.png", raw_depth())
+    write(folder / "labels.png", np.arange(192, dtype=np.uint8).reshape(SHAPE) % 3)
+    (folder / "scene_camera.json").rename(folder / "kept.json")
+    (folder / "camera.json").write_text(json.dumps(CAMERA))
+    assert load_observation(folder, background_ids=[2]).object_ids == (1,)
+    (folder / "kept.json").rename(folder / "scene_camera.json")
+    assert load_observation(scene, frame=7, background_ids=[3]).object_ids == (1,)
+
+
+def test_bop_data_of_several_scenes_or_cameras_is_listed(scene, tmp_path):
+    (scene / "scene_camera.json").rename(scene / "scene_camera_left.json")
+    (scene / "scene_camera_right.json").write_text("{}")
+    with pytest.raises(ObservationError, match=r"2 scenes or cameras.*_left\.json.*_right\.json"):
+        load_observation(scene)
+    with pytest.raises(ObservationError, match="lists no image"):
+        load_observation(scene / "scene_camera_right.json")
+
+
+def test_points_need_to_know_where_their_camera_was(tmp_path):
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    np.save(tmp_path / "a-points.npy", points)
+    with pytest.raises(ObservationError, match=r"where the camera was.*'camera_position'"):
+        load_observation(tmp_path / "a-points.npy")
+    pose = {"T_world_camera": look_at((0.0, -2.5, 1.0)).tolist()}
+    (tmp_path / "camera.json").write_text(json.dumps(pose))
+    seen = load_observation(tmp_path / "a-points.npy")
+    np.testing.assert_allclose(seen.pose, look_at((0.0, -2.5, 1.0)), atol=1e-12)
+
+
+def test_labels_of_points_are_a_column_or_a_file(tmp_path):
+    points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 4), (500, 3))
+    ids = (np.arange(500) % 3).astype(float)
+    np.save(tmp_path / "points.npy", np.column_stack([points, ids]))
+    seen = load_observation(tmp_path)
+    assert seen.object_ids == (1, 2)
+    np.save(tmp_path / "points.npy", np.column_stack([points, ids + 0.5]))
+    with pytest.raises(ObservationError, match="no whole ids"):
+        load_observation(tmp_path)
+    np.save(tmp_path / "points.npy", points)
+    np.save(tmp_path / "labels.npy", ids.astype(int) * 7)
+    assert load_observation(tmp_path).object_ids == (7, 14)
+    np.save(tmp_path / "points.npy", points[:, :2])
+    with pytest.raises(ObservationError, match=r"shape \(500, 2\); points are"):
+        load_observation(tmp_path)
+
+
+def test_a_mesh_is_no_view(tmp_path):
+    trimesh.creation.box().export(tmp_path / "box.ply")
+    with pytest.raises(ObservationError, match="is a mesh or empty"):
+        load_observation(tmp_path / "box.ply")
+
+
+def test_a_lens_is_undone_in_labels_of_any_form(folder):
+    labels = np.zeros(SHAPE, int)
+    labels[:4] = 1
+    content = {**CAMERA, "distortion": [0.9, 0.0, 0.0, 0.0]}
+    (folder / "camera.json").write_text(json.dumps(content))
+    np.save(folder / "labels.npy", labels)
+    ids = load_observation(folder)
+    np.save(folder / "labels.npy", (labels == 1)[None])
+    np.testing.assert_array_equal(load_observation(folder).labels, ids.labels)
+    assert (ids.labels != labels).any()
+
+
+def test_topics_are_asked_of_recordings_only(folder):
+    for asked in ({"depth": "/x"}, {"at": 1.0}, {"frame": "base"}):
+        with pytest.raises(ObservationError, match="no recording"):
+            load_observation(folder, **asked)
+
+
 def test_faulty_npz(tmp_path):
     path = tmp_path / "view.npz"
     path.write_bytes(b"junk")
@@ -332,7 +457,7 @@ def test_faulty_npz(tmp_path):
     with pytest.raises(ObservationError, match="without pickle"):
         load_observation(path)
     np.savez(path, depth=np.full((12, 16), -np.inf), intrinsics=K)
-    with pytest.raises(ObservationError, match="depth is -inf"):
+    with pytest.raises(ObservationError, match="infinite everywhere"):
         load_observation(path)
     for wrong in (np.ones(2), 0.0, "far"):
         np.savez(path, depth=np.ones((12, 16)), intrinsics=K, max_range=wrong)

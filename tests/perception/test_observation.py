@@ -100,11 +100,6 @@ BAD_DEPTH = {
     "shape": (np.ones((6, 8, 1)), r"\(6, 8, 1\)"),
     "empty": (np.ones((0, 8)), r"\(0, 8\)"),
     "raw": (np.ones((6, 8), np.uint16), "uint16.*metres"),
-    "minus inf": (with_value(depth(), (2, 3), -np.inf), r"-inf at row 2, column 3 \(1 neg"),
-    "minus inf, made finite": (
-        np.nan_to_num(with_value(depth(), (2, 3), -np.inf).astype(np.float32)),
-        "-inf at row 2.*neginf=0",
-    ),
     "negative": (with_value(depth(), (5, 7), -0.5), "-0.5 at row 5, column 7"),
     "millimetres": (depth(700.0), "millimetres"),
     "scaled twice": (depth(0.0007), "scaled twice"),
@@ -114,6 +109,7 @@ BAD_DEPTH = {
     ),
     "nothing": (depth(0.0), "0, NaN or infinite everywhere"),
     "nothing, in words": (depth(np.nan), "0, NaN or infinite everywhere"),
+    "too near": (depth(-np.inf), "0, NaN or infinite everywhere"),
     "too far": (
         depth(12.5),
         "every depth return lies beyond max_range = 10 m, the nearest at 12.5",
@@ -138,6 +134,15 @@ def test_what_stands_for_no_return_becomes_zero_without_a_word(value, dtype):
     assert obs.depth[2, 3] == 0.0
     assert (obs.depth > 0).sum() == 47
     assert obs.warnings == ()
+
+
+@pytest.mark.parametrize("value", [-np.inf, np.nan_to_num(np.float32(-np.inf))])
+def test_what_is_too_near_to_measure_becomes_no_return_and_is_named(value):
+    obs = Observation(with_value(depth(), (2, 3), value), None, K)
+    np.testing.assert_array_equal(obs.depth, with_value(depth(), (2, 3), 0.0))
+    (warning,) = obs.warnings
+    assert "-inf at 1 pixels, nearer than the sensor measures" in warning
+    assert replace(obs, labels=np.ones((6, 8), int)).warnings == (warning,)
 
 
 @pytest.mark.parametrize("pixels", [np.s_[2, 3], np.s_[:, :7]])  # one, and most of the image

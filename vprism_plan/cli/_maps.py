@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Commands about the map itself: `map` and `mesh`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,30 +16,55 @@ if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
 
 
-def fit_view(
-    path: Path, seed: int, console: Console, frame: int | None = None, preset: str = "default"
+def fit_views(
+    paths: Sequence[Path],
+    seed: int,
+    console: Console,
+    preset: str = "default",
+    asked: dict[str, Any] | None = None,
 ) -> "VPrismMap":
-    """Fit a map to a view; segment it if it has no labels, align it if it has no pose.
+    """Fit a map to views; segment what has no labels, align a single one that has no pose.
+
+    A folder of views stands for all of them; `asked` are options of `load_observation`.
 
     Raises:
-        ObservationError: the view cannot be used, or shows no object.
+        ObservationError: a view cannot be used, none shows an object, or one of several is unposed.
     """
     from vprism_plan.mapping import MapConfig, fit_map
     from vprism_plan.perception import align_to_table, load_observation, segment_tabletop
+    from vprism_plan.perception.readers import views_in
 
     with console.stage("load"):
-        obs = load_observation(path, frame=frame)
-    if obs.labels is None:
-        with console.stage("segment"):
-            obs = segment_tabletop(obs, seed=seed)
-    obs.require_objects()
-    if not obs.posed:
-        with console.stage("align"):
-            obs = align_to_table(obs, seed=seed)
+        files = [file for path in paths for file in views_in(path) or [path]]
+        views = [load_observation(file, **(asked or {})) for file in files]
+    for number, obs in enumerate(views):
+        if len(views) > 1 and not obs.posed:
+            raise ObservationError(
+                f"{files[number]} has no camera pose, which each of several views needs: "
+                "T_world_camera in camera.json, or pose.txt beside the image"
+            )
+        if obs.labels is None:
+            with console.stage("segment"):
+                views[number] = segment_tabletop(obs, seed=seed)
+        if len(views) == 1:
+            views[number].require_objects()
+        if not obs.posed:
+            with console.stage("align"):
+                views[number] = align_to_table(views[number], seed=seed)
     with console.stage("fit"):
-        m = fit_map(obs, MapConfig.paper() if preset == "paper" else MapConfig(), seed=seed)
+        m = fit_map(views, MapConfig.paper() if preset == "paper" else MapConfig(), seed=seed)
     console.warn(m.warnings)
     return m
+
+
+def asked_of(command: Command) -> dict[str, Any]:
+    """Return what was asked of a view, for `fit_views`."""
+    return {
+        "frame": command.frame,
+        "depth": command.depth,
+        "at": command.at,
+        "background_ids": command.background,
+    }
 
 
 def load(path: Path, console: Console) -> "VPrismMap":
@@ -71,7 +97,7 @@ def run_map(command: Command, console: Console) -> int:
     output = command.output
     if output.is_dir():
         raise ObservationError(f"{output} is a folder; --output must name a file")
-    m = fit_view(command.input, command.seed, console, command.frame, command.preset)
+    m = fit_views(command.input, command.seed, console, command.preset, asked_of(command))
     with console.stage("save"), replacing(output) as temporary:
         m.save(temporary)
     size, segmented = output.stat().st_size, "segment" in console.timings

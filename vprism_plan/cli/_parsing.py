@@ -43,7 +43,7 @@ class _Parser(argparse.ArgumentParser):
         """
         name, *values = what.split()
         if not name.startswith("--"):
-            self.add_argument(more.pop("dest"), type=kind, metavar=name, help=text)
+            self.add_argument(more.pop("dest"), type=kind, metavar=name, help=text, **more)
             return
         if kind is bool:
             self.add_argument(name, action="store_true", help=text)
@@ -90,16 +90,17 @@ def _demo(command: _Parser) -> None:
 
 
 def _map(command: _Parser) -> None:
-    """Fit a map to one view and save it.
+    """Fit a map to one view or several and save it.
 
-    VIEW is an .npz, a folder (depth.png, camera.json, optional labels.png), a BOP scene or
-    X-depth.png beside camera.json. Without labels it is segmented; without a camera pose the
-    world is laid on the table (z up, table at z = 0).
+    VIEW is an .npz, a folder (depth.png, camera.json, optional labels.png), a BOP scene,
+    X-depth.png beside camera.json, a point cloud (.pcd, .ply, .npy), a recording (.bag, .mcap,
+    .db3, ROS 2 folder), or a folder of such views. Without labels it is segmented; without a
+    camera pose, which several views need, the world is laid on the table (z up, table at z = 0).
     """
     take = command.take
-    take("VIEW", Path, "the view", dest="input")
+    take("VIEW", Path, "the views", dest="input", nargs="+")
     take("--output FILE", Path, "file to write", Path("map.safetensors"))
-    take("--frame N", int, "image of a BOP scene; default the first")
+    _source(command)
     text = "settings of the fit, calibrated for planning or the paper's Table III"
     take("--preset NAME", ("default", "paper"), text, "default")
     take("--seed N", int, "of the sampling", 0)
@@ -128,7 +129,7 @@ def _plan(command: _Parser) -> None:
     text = "clearance to keep, m; if there is room all along, the path keeps 5 to 20 mm more"
     take("--margin M", float, text, 0.0)
     _rules(command)
-    take("--frame N", int, "image of a BOP scene; default the first")
+    _source(command)
     take("--seed N", int, "of the fit, of what is chosen, and of the planner", 0)
     _strict(command)
 
@@ -224,6 +225,21 @@ def _results(command: _Parser, folder: str) -> None:
         "and report.json"
     )
     command.take("--output FOLDER", Path, text, Path(folder))
+
+
+def _source(command: _Parser) -> None:
+    text = "image of a BOP scene, default the first; or TF frame of a recording, the world (z up)"
+    command.take("--frame FRAME", _frame, text)
+    text = "topic of depth images in a recording; topics are listed if there is a choice"
+    command.take("--depth TOPIC", str, text)
+    text = "time of a recording's image from its start, s; default the first image"
+    command.take("--at S", float, text)
+    command.take("--background ID ...", int, "labels that are no object", ())
+
+
+def _frame(text: str) -> int | str:
+    """Return the number of an image, or the name of a frame."""
+    return int(text) if text.removeprefix("-").isdecimal() else text
 
 
 def _strict(command: _Parser) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from vprism_plan._resources import data_path, urdf_path
 from vprism_plan.cli._console import Console, dump_json, staged
-from vprism_plan.cli._maps import describe_map, fit_view, load, write_meshes
+from vprism_plan.cli._maps import asked_of, describe_map, fit_views, load, write_meshes
 from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import Surroundings, choose_ends, places
 from vprism_plan.cli._warmup import compile_checks_meanwhile
@@ -53,7 +53,7 @@ def run_demo(command: Command, console: Console) -> int:
 
     folder, seed = data_path("demo_scene"), command.seed
     compile_checks_meanwhile()
-    m = fit_view(folder, seed, console)
+    m = fit_views([folder], seed, console)
     with console.stage("bake"):
         world = World(m)
     around = Surroundings.of(m)
@@ -90,7 +90,7 @@ def run_plan(command: Command, console: Console) -> int:
         m = load(command.input, console)
     else:
         compile_checks_meanwhile()
-        m = fit_view(command.input, command.seed, console, command.frame)
+        m = fit_views([command.input], command.seed, console, asked=asked_of(command))
     world = bake(m, command, console)
     around, ends = Surroundings.of(m), None
     with console.stage("place"):

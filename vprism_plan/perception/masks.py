@@ -21,7 +21,8 @@ from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane, least_squares_plane, refine
 from vprism_plan.perception.plane_fitting import standing_on
 
-_VOID = (255, 65535, 2**31 - 1)  # what data sets write for "unknown" or "all the rest"
+# What data sets write for "unknown" or "all the rest"; as colours white, and the rim of VOC.
+_VOID = (255, 65535, 2**31 - 1, 0xFFFFFF, 0xE0E0C0)
 _OUTLINED = 0.5  # share of the other objects' outlines that lies beside an unknown rim
 _SIDES = 3  # sides of the image, a tenth of each, that "all the rest" reaches
 _SAMPLE = 600  # points of a label that a plane is fitted to

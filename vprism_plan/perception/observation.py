@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """One view of the scene: depth, labels and a known camera."""
 
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -12,6 +12,7 @@ from vprism_plan._arguments import number, rigid_pose
 from vprism_plan._shapes import Pixels, PointImage, Points, Pose, Vector
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import backproject, point_image, within_balls
+from vprism_plan.perception.labels import label_image, to_numpy
 from vprism_plan.perception.plane import Plane
 
 # Metres. Sensors for table tops end before it, and stereo knows nothing of centimetres there.
@@ -31,8 +32,9 @@ class Observation:
 
     Attributes:
         depth: (H, W) float32 or float64, metres along the optical axis (not along the ray),
-            0 = no return. NaN, infinity and what lies beyond `max_range` become 0.
-        labels: (H, W) int32, 0 = background, positive = object id; None = not segmented.
+            0 = no return. NaN, infinities and what lies beyond `max_range` become 0.
+        labels: (H, W) int32, 0 = background, positive = object id; None = not segmented. Given
+            may also be masks (N, H, W), colours, and SAM's and COCO's lists: see `label_image`.
         intrinsics: (3, 3) float64 pinhole matrix, pixels, pixel centres at whole numbers.
         T_world_camera: (4, 4) float64, maps camera to world coordinates; None = unposed,
             and then the world frame *is* the camera frame.
@@ -47,6 +49,7 @@ class Observation:
             handed on to the map, the world and every verdict.
         max_range: metres of depth beyond which a return is none: what lies there is a driver's
             value for "no data", or a mirror, and must not make all before it free.
+        background_ids: only given: ids among `labels` that are no object; they become 0.
 
     Raises:
         ObservationError: what is wrong, what would be valid, and the remedy.
@@ -61,8 +64,9 @@ class Observation:
     robot_spheres: Any = None
     warnings: tuple[str, ...] = ()
     max_range: float = DEFAULT_MAX_RANGE
+    background_ids: InitVar[Any] = ()
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, background_ids: Any) -> None:
         max_range = number("max_range", self.max_range, 0.0, above=True, error=ObservationError)
         depth, found = check_depth(self.depth, max_range)
         checked: dict[str, Any] = {
@@ -71,7 +75,9 @@ class Observation:
             "intrinsics": check_intrinsics(self.intrinsics, depth.shape),
         }
         if self.labels is not None:
-            checked["labels"] = check_labels(self.labels, depth.shape)
+            shape = (depth.shape[0], depth.shape[1])
+            checked["labels"], said = label_image(self.labels, shape, background_ids)
+            found += said
         if self.T_world_camera is not None:
             checked["T_world_camera"] = check_pose(self.T_world_camera)
         if self.color is not None:
@@ -83,6 +89,41 @@ class Observation:
         checked["warnings"] = tuple(dict.fromkeys([*map(str, self.warnings), *found]))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Any,
+        labels: Any,
+        camera_position: Any,
+        intrinsics: Any = None,
+        **more: Any,
+    ) -> "Observation":
+        """Return the view that a point cloud is, as its camera saw it.
+
+        Args:
+            points: metres; NaN and (0, 0, 0) are no points. (H, W, 3), organised, is one point per
+                pixel: intrinsics, and the turn of the camera, are recovered from the grid; if it
+                is no pinhole image, a warning says so and it is taken as unorganised. (N, 3),
+                unorganised, is looked at from `camera_position` in an image in which surfaces
+                have no holes. A pixel has the nearest of its points.
+            labels: for (H, W, 3) what `labels` may be, for (N, 3) ids (N,); None = not segmented.
+            camera_position: (3,) in the frame of the points, metres, or (4, 4), the pose of the
+                optical frame in it. That frame is the view's world, z up. Only if the camera is at
+                its origin and all points have z > 0 are they taken to be in the optical frame
+                itself: the view is unposed.
+            intrinsics: (3, 3), pixels, if known; for (N, 3) those of the image to make.
+            more: other attributes of a view: `plane`, `max_range`, `background_ids`, `color`
+                (organised points only), `warnings`.
+
+        Raises:
+            ObservationError: what is wrong, what would be valid, and the remedy.
+        """
+        from vprism_plan.perception.point_clouds import image_of
+
+        seen = image_of(points, labels, camera_position, intrinsics)
+        seen["warnings"] += tuple(more.pop("warnings", ()))
+        return cls(**seen, **more)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -165,25 +206,11 @@ class Observation:
 
 
 # ------------------------------------------------------------------------------------- checks
-def to_numpy(value: Any, name: str) -> np.ndarray:
-    """Return a fresh array from an array, nested list or torch tensor (any device)."""
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
-    try:
-        array = np.array(value)
-    except (ValueError, TypeError) as error:
-        raise ObservationError(f"{name} is not an array: {error}") from error
-    if array.dtype.kind not in "biuf":
-        kind = "Python objects" if array.dtype == object else array.dtype
-        raise ObservationError(f"{name} holds {kind} ({type(value).__name__}); give numbers")
-    return array
-
-
 def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return depth as a (H, W) float32 or float64 array in metres, 0 = no return.
 
-    NaN, infinity and what lies beyond `max_range` (metres) are no returns; the latter, which a
-    sensor or a driver made up, is named in the second value.
+    NaN, infinities and what lies beyond `max_range` (metres) are no returns. Named in the second
+    value: -inf (REP 117: too near to measure), and what lies beyond, which a sensor made up.
     """
     depth = to_numpy(value, "depth")
     if depth.ndim != 2 or 0 in depth.shape:
@@ -195,30 +222,35 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
         )
     if depth.dtype not in (np.float32, np.float64):
         depth = depth.astype(np.float32 if depth.dtype.itemsize <= 4 else np.float64)
-    negative = depth < 0
+    near = depth <= -_INFINITE
+    negative = (depth < 0) & ~near
     if negative.any():
         row, col = np.argwhere(negative)[0]
-        infinite = depth[row, col] <= -_INFINITE
         raise ObservationError(
-            f"depth is {'-inf' if infinite else format(depth[row, col], 'g')} at row {row}, column "
-            f"{col} ({int(negative.sum())} negative pixels); it must be positive metres along the "
-            "optical axis, or 0 where there is no return"
-            + ("; np.nan_to_num(depth, posinf=0, neginf=0) says so" if infinite else "")
+            f"depth is {depth[row, col]:g} at row {row}, column {col} ({int(negative.sum())} "
+            "negative pixels); it must be positive metres along the optical axis, or 0 where there "
+            "is no return"
         )
-    depth[~(depth < _INFINITE)] = 0.0  # NaN compares false
+    found: tuple[str, ...] = ()
+    if near.any():
+        found = (
+            f"depth is -inf at {int(near.sum())} pixels, nearer than the sensor measures: they "
+            "count as no return, so that what stands there is not in the map",
+        )
+    depth[near | ~(depth < _INFINITE)] = 0.0  # NaN compares false
     valid = depth[depth > 0]
     _check_scale(valid, max_range)
     beyond = depth > max_range
     depth = np.ascontiguousarray(depth)
     if not beyond.any():
-        return depth, ()
-    found = (
+        return depth, found
+    found += (
         f"{int(beyond.sum())} depth returns ({100 * beyond.sum() / valid.size:.2g} %) lie beyond "
         f"max_range = {max_range:g} m, the farthest at {valid.max():.4g} m; they count as no "
-        "return: is it the sensor's value for 'no data'? If they are real, raise max_range"
+        "return: is it the sensor's value for 'no data'? If they are real, raise max_range",
     )
     depth[beyond] = 0.0
-    return depth, (found,)
+    return depth, found
 
 
 def _check_scale(valid: np.ndarray, max_range: float) -> None:
@@ -241,22 +273,6 @@ def _check_scale(valid: np.ndarray, max_range: float) -> None:
     if median < MIN_MEDIAN_DEPTH:
         found = f"median depth is {median:g} m, less than {MIN_MEDIAN_DEPTH:g} m"
         raise ObservationError(f"{found}: it looks as if depth was scaled twice; give metres")
-
-
-def check_labels(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return labels as a (H, W) int32 array of the depth's shape, 0 = background."""
-    labels = to_numpy(value, "labels")
-    if labels.shape != shape:
-        wanted = "they must be one image registered to the depth"
-        raise ObservationError(f"labels have shape {labels.shape} but depth {shape}; {wanted}")
-    if labels.dtype.kind not in "iub":
-        wanted = "they must be integers: 0 background, 1, 2, ... objects"
-        raise ObservationError(f"labels are {labels.dtype}; {wanted}")
-    if labels.min() < 0 or labels.max() > np.iinfo(np.int32).max:
-        worst = labels.min() if labels.min() < 0 else labels.max()
-        wanted = "they must be 0 (background) or positive object ids that fit in int32"
-        raise ObservationError(f"labels contain {worst}; {wanted}")
-    return np.ascontiguousarray(labels, dtype=np.int32)
 
 
 def check_intrinsics(value: Any, shape: tuple[int, ...]) -> np.ndarray:
