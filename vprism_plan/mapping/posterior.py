@@ -120,11 +120,7 @@ class VPrismMap:
         mean, variance = self._bias_moments[0].copy(), self._bias_moments[1]
         if self.prior is not None:
             mean[1:] += float(self.prior.elsewhere.max())
-        return float(
-            prediction.occupied_probability(
-                torch.from_numpy(mean)[None], torch.from_numpy(variance)[None]
-            )[0]
-        )
+        return float(np.exp(self._normalised(mean[None], variance[None])[0, 1:]).sum())
 
     # ------------------------------------------------------------------ predictions
     def predict_proba(self, points: Any) -> Any:
@@ -134,9 +130,8 @@ class VPrismMap:
         is taken as a numpy array and gives float64 numpy. Normalised approximation of
         section IV-B. MapError on a wrong shape or a value that is not finite.
         """
-        if isinstance(points, Tensor):
-            return prediction.class_probabilities(*self._torch_moments(points)[:2]).to(points.dtype)
-        return np.exp(self._log_probabilities(points))
+        log_p = self._log_probabilities(points)
+        return log_p.exp().to(points.dtype) if isinstance(log_p, Tensor) else np.exp(log_p)
 
     def log_proba_and_support(self, points: Any) -> tuple[Any, Any]:
         """Return log P(class | x), (N, K), and the kernel mass, (N,), at points (N, 3) m.
@@ -153,17 +148,16 @@ class VPrismMap:
 
     def occupancy(self, points: Any) -> Any:
         """Return P(occupied) = 1 - P(class 0) for points (N, 3) m: (N,)."""
-        if isinstance(points, Tensor):
-            return prediction.occupied_probability(*self._torch_moments(points)[:2]).to(
-                points.dtype
-            )
-        return np.exp(self._log_probabilities(points)[:, 1:]).sum(axis=1)
+        log_p = self._log_probabilities(points)[:, 1:]  # the sum keeps digits that 1 - p loses
+        if isinstance(log_p, Tensor):
+            return log_p.exp().sum(dim=1).to(points.dtype)
+        return np.exp(log_p).sum(axis=1)
 
     def entropy(self, points: Any) -> Any:
         """Return the entropy (nats) of the class probabilities at points (N, 3) m: (N,)."""
-        if isinstance(points, Tensor):
-            return prediction.class_entropy(*self._torch_moments(points)[:2]).to(points.dtype)
         log_p = self._log_probabilities(points)
+        if isinstance(log_p, Tensor):
+            return -(log_p.exp() * log_p).sum(dim=1).to(points.dtype)
         return -(np.exp(log_p) * log_p).sum(axis=1)
 
     def support(self, points: Any) -> Any:
@@ -305,7 +299,10 @@ class VPrismMap:
         mean = np.array([own.mean[-1] for own in classes])
         return mean, np.array([own.covariance[-1] for own in classes])
 
-    def _log_probabilities(self, points: Any) -> Float[np.ndarray, "n k"]:
+    def _log_probabilities(self, points: Any) -> Any:
+        """Log P(class | x), (N, K) float64: a tensor for a tensor, else an array."""
+        if isinstance(points, Tensor):
+            return prediction.class_log_probabilities(*self._torch_moments(points)[:2])
         return self._normalised(*self._moments(_checked_points(points))[:2])
 
     def _normalised(

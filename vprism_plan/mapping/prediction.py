@@ -29,33 +29,11 @@ def log_scores(mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]) -> Fl
     return -torch.logsumexp(gap / torch.sqrt(spread), dim=2)
 
 
-def class_probabilities(
-    mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
-) -> Float[Tensor, "n k"]:
-    """Return the normalised prediction; every row sums to 1."""
-    return torch.softmax(log_scores(mean, variance), dim=1)
-
-
 def class_log_probabilities(
     mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
 ) -> Float[Tensor, "n k"]:
     """Return the logarithm of the normalised prediction."""
     return torch.log_softmax(log_scores(mean, variance), dim=1)
-
-
-def class_entropy(
-    mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
-    """Return -sum_k p_k ln p_k, nats."""
-    log_p = class_log_probabilities(mean, variance)
-    return -(log_p.exp() * log_p).sum(dim=1)
-
-
-def occupied_probability(
-    mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
-) -> Float[Tensor, " n"]:
-    """Return 1 - p_0, as the sum of the object classes so that small values keep their digits."""
-    return class_probabilities(mean, variance)[:, 1:].sum(dim=1)
 
 
 class _NoSecondDerivative(torch.autograd.Function):
