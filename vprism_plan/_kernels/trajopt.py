@@ -277,13 +277,13 @@ def _over(wf, o, x, y, z):
 
 
 @njit(cache=True, nogil=True)
-def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, active):
-    """Fill each sphere's potential and its slope at the centre; whether any is not 0.
+def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, G, active):
+    """Fill the slope of each sphere's potential at its centre; return the sum of them all.
 
     Links that are not active are wholly beyond the margin.
     """
     margin = wf[6]
-    found = False
+    total = 0.0
     for link in range(ri[2]):
         li = ri[9] + 4 * link
         rule = ri[li + 3]
@@ -302,26 +302,24 @@ def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, ac
         active[link] = True
         place_link(link, T, rf, ri, C)
         for s in range(ri[li + 1], ri[li + 2]):
-            value[s] = 0.0
             for a in range(3):
                 G[a, s] = 0.0
             x, y, z = C[0, s], C[1, s], C[2, s]
             if _may_be_below(V, E, rule, wf, x, y, z, grown[s] + margin):
                 gap = _distance(V, rule, wf, x, y, z, slope) - grown[s]
                 if gap < margin:
-                    found = True
-                    value[s], steep = _hinge(gap, margin)
+                    value, steep = _hinge(gap, margin)
+                    total += value
                     for a in range(3):
                         G[a, s] = steep * slope[a]
             for p in range(int(wf[5])):
                 gap = _over(wf, 8 + 4 * p, x, y, z) - radii[s]
                 if gap < margin:
-                    found = True
-                    more, steep = _hinge(gap, margin)
-                    value[s] += more
+                    value, steep = _hinge(gap, margin)
+                    total += value
                     for a in range(3):
                         G[a, s] += steep * wf[8 + 4 * p + a]
-    return found
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -330,80 +328,16 @@ def clearance(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
     T = np.empty((ri[0], 12))
     L = np.empty((ri[2], 3))
     C = np.empty((3, ri[1]))
-    value = np.zeros(ri[1])
     G = np.zeros((3, ri[1]))
     active = np.zeros(ri[2], np.bool_)
     slope = np.empty(3)
     total = 0.0
     for i in range(len(q)):
         _frames(q[i], rf, ri, T, L)
-        if _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, value, G, active):
+        value = _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, G, active)
+        if value > 0.0:
+            total += weight[i] * value
             _pull(T, C, G, active, rf, ri, weight[i], edge[i], fraction[i], grad)
-            for link in range(ri[2]):
-                if active[link]:
-                    li = ri[9] + 4 * link
-                    for s in range(ri[li + 1], ri[li + 2]):
-                        total += weight[i] * value[s]
-    return total
-
-
-@njit(cache=True, nogil=True)
-def clearance_by_length(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
-    """The same over the ways of the spheres' centres; sample by sample, the last one kept."""
-    n = ri[1]
-    T = np.empty((2, ri[0], 12))
-    L = np.empty((ri[2], 3))
-    C = np.empty((2, 3, n))
-    value = np.zeros((2, n))
-    G = np.zeros((2, 3, n))
-    F = np.zeros((2, 3, n))
-    active = np.zeros(ri[2], np.bool_)
-    everywhere = np.ones(ri[2], np.bool_)
-    slope = np.empty(3)
-    total = 0.0
-    for i in range(len(q) + 1):
-        now = i & 1
-        old = 1 - now
-        if i < len(q):
-            _frames(q[i], rf, ri, T[now], L)
-            for link in range(ri[2]):
-                place_link(link, T[now], rf, ri, C[now])
-            value[now] = 0.0
-            G[now] = 0.0
-            F[now] = 0.0
-            _obstacle_terms(
-                T[now], L, C[now], rf, ri, V, E, wf, radii, grown, slope,
-                value[now], G[now], active,
-            )  # fmt: skip
-            if i > 0:
-                total += _segment(C, value, G, F, now)
-        if i > 0:  # nothing is added to the forces on the sample before any more
-            _pull(
-                T[old], C[old], F[old], everywhere, rf, ri, 1.0, edge[i - 1], fraction[i - 1], grad
-            )
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _segment(C, value, G, F, now):
-    """Cost of the way between two samples; adds the forces on both."""
-    old = 1 - now
-    total = 0.0
-    for s in range(C.shape[2]):
-        both = 0.5 * (value[0, s] + value[1, s])
-        if both == 0.0:
-            continue
-        x = C[now, 0, s] - C[old, 0, s]
-        y = C[now, 1, s] - C[old, 1, s]
-        z = C[now, 2, s] - C[old, 2, s]
-        length = math.sqrt(x * x + y * y + z * z + _SHORT * _SHORT)
-        way = length - _SHORT
-        total += both * way
-        pull = both / length
-        for a in range(3):
-            along = pull * (C[now, a, s] - C[old, a, s])
-            F[now, a, s] += 0.5 * way * G[now, a, s] + along
-            F[old, a, s] += 0.5 * way * G[old, a, s] - along
     return total
 
 
@@ -453,18 +387,26 @@ def _soft_contact(x, cut):
 
 
 @njit(cache=True, nogil=True)
-def certain_hazards(centers, rules, V, E, wf, radii, grown, soft, cut, value, slopes):
-    """Hazard of contact with the field and the planes for spheres (n, s, 3), and its slopes."""
+def certain_potentials(centers, rules, V, E, wf, radii, grown, soft, cut, value, slopes):
+    """Potential of the field and the planes for spheres (n, s, 3), and its slopes: CHOMP's, or the
+    hazard of contact where the margin is 0."""
+    margin = wf[6]
     value[:] = 0.0
     slopes[:] = 0.0
-    which, depth, steeper = _contacts(centers, rules, V, E, wf, radii, grown, cut * soft)
+    reach = margin if margin > 0.0 else cut * soft
+    which, depth, steeper = _contacts(centers, rules, V, E, wf, radii, grown, reach)
     for c in range(len(depth)):
         n = which[c, 0]
         s = which[c, 1]
-        more, steep = _soft_contact(depth[c] / soft, cut)
+        if margin > 0.0:
+            more, steep = _hinge(-depth[c], margin)
+            steep = -steep
+        else:
+            more, steep = _soft_contact(depth[c] / soft, cut)
+            steep /= soft
         value[n, s] += more
         for a in range(3):
-            slopes[n, s, a] += steep / soft * steeper[c, a]
+            slopes[n, s, a] += steep * steeper[c, a]
 
 
 @njit(cache=True, nogil=True)

@@ -222,7 +222,7 @@ class OccupancyCost(_PosteriorCost):
         packed = certain.packed(0.0, 0.0, self._planes)
 
         def fill(x: np.ndarray, value: np.ndarray, slopes: np.ndarray) -> None:
-            kernels.certain_hazards(
+            kernels.certain_potentials(
                 x, self._rules, certain.values, certain.blocks, packed, self._radii, self._grown,
                 self._softness, _CUT, value, slopes,
             )  # fmt: skip

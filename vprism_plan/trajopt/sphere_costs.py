@@ -20,6 +20,7 @@ from vprism_plan.trajopt.cost import (
     Samples,
     Subdivision,
     TrajectoryCost,
+    compiled_per_sphere,
     require_dof,
     sample_paths,
 )
@@ -78,7 +79,7 @@ class SphereCost(TrajectoryCost):
         require_dof(self.robot, q)
         flat = q.reshape(-1, *q.shape[-2:])
         fast = self._compiled if q.device.type == "cpu" else None
-        if fast is not None and self._kernel is not None:
+        if fast is not None and self._kernel is not None and not self.arc_length:
             plain = partial(self._costs, fast=None)
             costs = fast.costs(flat, self.subdivision, self._kernel, plain)
         else:
@@ -230,18 +231,26 @@ class ClearanceCost(SceneCost):
 
     def _kernel(self, grad: np.ndarray, *samples: np.ndarray) -> float:
         assert self._compiled is not None
-        kernel = kernels.clearance_by_length if self.arc_length else kernels.clearance
-        return kernel(
+        return kernels.clearance(
             *samples, self._compiled.floats, self._compiled.ints, self._field.values,
             self._field.blocks, self._packed, *self._both, grad,
         )  # fmt: skip
 
     def _potential(self, centers: Float[Tensor, "m s 3"], fast: bool) -> Float[Tensor, "m s"]:
-        need = torch.as_tensor(grown(self._radii, self._field.spacing)).to(centers)
-        total = hinge(self._field(centers, self._rules) - need, self.margin)
-        for gap in self._plane_gaps(centers):
-            total = total + hinge(gap, self.margin)
-        return total
+        need = grown(self._radii, self._field.spacing)
+
+        def fill(x: np.ndarray, value: np.ndarray, slopes: np.ndarray) -> None:
+            kernels.certain_potentials(
+                x, self._rules, self._field.values, self._field.blocks, self._packed,
+                self._radii, need, 0.0, 0.0, value, slopes,
+            )  # fmt: skip
+
+        def plain(x: Tensor) -> Tensor:
+            gap = self._field(x, self._rules) - torch.as_tensor(need).to(x)
+            gaps = [gap, *self._plane_gaps(x)]
+            return torch.stack([hinge(gap, self.margin) for gap in gaps]).sum(dim=0)
+
+        return compiled_per_sphere(centers, fill, plain) if fast else plain(centers)
 
 
 _AT_ONCE = 1 << 22  # sphere pairs in memory at once
