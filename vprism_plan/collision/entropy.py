@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan._arguments import number
+from vprism_plan.collision.explain import unit_ball_points
 from vprism_plan.collision.motion import edges_of, place_points
 from vprism_plan.collision.packing import Numbers, Rows, Waypoints
 from vprism_plan.errors import RobotError
@@ -138,22 +139,11 @@ def _entropy(checker: Any, points: Points) -> tuple[Float[np.ndarray, " k"], Cho
     return entropy, supported, int(near.sum() + supported.sum())
 
 
-def _even_points(n: int) -> Points:
-    """Points spread evenly over the volume of the unit ball: a spiral, its radii shuffled."""
-    i = np.arange(n) + 0.5
-    height = 1.0 - 2.0 * i / n
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * i
-    around = np.sqrt(1.0 - height**2)
-    directions = np.column_stack([around * np.cos(turn), around * np.sin(turn), height])
-    # 0.7549: the inverse of the plastic number, the best second irrational beside the golden.
-    return directions * np.cbrt((0.7548776662466927 * i) % 1.0)[:, None]
-
-
 def _at_waypoints(
     checker: Any, path: Waypoints
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int]:
     """Mean, largest sphere average and unsupported share per waypoint; points asked."""
-    ball = _even_points(_POINTS)
+    ball = unit_ball_points(_POINTS, surface=False)
     mean, most, unsupported, asked = [], [], [], 0
     for q in path:
         centers, radii = _moving(checker, q[None])

@@ -29,14 +29,16 @@ _FEW_SAMPLES = 16  # where many configurations are asked about
 _AROUND = 2  # nodes beyond a point's cell that are asked for the nearest obstacle's name
 
 
-def unit_ball_points(n: int = _SAMPLES) -> Points:
-    """Return n points spread evenly through the unit ball, its surface included."""
+def unit_ball_points(n: int = _SAMPLES, surface: bool = True) -> Points:
+    """Return n points spread evenly through the unit ball, a fourth of them on its surface if that
+    is to be asked as well: a spiral, its radii shuffled."""
     i = np.arange(n) + 0.5
     polar = np.arccos(1.0 - 2.0 * i / n)
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * i
-    # Radii follow a second low-discrepancy sequence so that volume is covered evenly.
+    # 0.7549: the inverse of the plastic number, the best second irrational beside the golden.
     radius = np.cbrt((i * 0.7548776662466927) % 1.0)
-    radius[::4] = 1.0
+    if surface:
+        radius[::4] = 1.0
     directions = np.column_stack(
         [np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)]
     )

@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from vprism_plan.errors import MissingDependencyError
 
@@ -51,7 +51,7 @@ class Shape:
             return getattr(module, self.kind.capitalize())(*map(float, self.size))
         vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
         faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
-        self.normals = face_normals(vertices, faces)
+        self.normals = np.asarray(mesh.face_normals)
         model = module.BVHModel()
         model.beginModel(len(vertices), len(faces))
         model.addSubModel(vertices, faces)
@@ -77,16 +77,6 @@ class Shape:
         if self.normals is None:
             raise ValueError(f"a {self.kind} has no triangles")
         return self._rotation @ self.normals[face]
-
-
-def face_normals(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> Float[np.ndarray, "f 3"]:
-    """Unit normals; a triangle without area gets the zero vector."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(lengths > 0.0, lengths, 1.0)
 
 
 def touches(a: Shape, b: Shape) -> bool:

@@ -219,16 +219,9 @@ class PlacedSolids:
         return (points - T[:3, 3]) @ T[:3, :3]
 
     def from_links(self, solids: Int[np.ndarray, "n"], points: Points) -> Points:
-        """World positions of points in the frames of the links of some solids, given link by
-        link."""
-        rows = self._row[solids]
-        ends = [0, *(np.flatnonzero(np.diff(rows)) + 1).tolist(), len(rows)]
-        parts = [np.empty((0, 3))]
-        for a, b in itertools.pairwise(ends):
-            if b > a:
-                T = self._link_poses[rows[a]]
-                parts.append(points[a:b] @ T[:3, :3].T + T[:3, 3])
-        return np.concatenate(parts)
+        """World positions of points in the frames of the links of some solids."""
+        T = self._link_poses[self._row[solids]]
+        return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
 
     def points_within(self, i: int, points: Points, reach: Values) -> Iterator[int]:
         """Rows of points (world) that lie in a solid, or within `reach` (metres) of it; those
@@ -387,15 +380,12 @@ class MeshWorld:
 
 def mesh_body(name: str, mesh: Any, class_index: int = 0) -> Body:
     """Wrap a `trimesh.Trimesh` in world coordinates."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
+    from trimesh.graph import connected_component_labels
 
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     faces = np.asarray(mesh.faces)
     used = vertices[np.unique(faces)]
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    joined = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(len(vertices),) * 2)
-    _, piece = connected_components(joined, directed=False)
+    piece = connected_component_labels(mesh.edges, node_count=len(vertices))
     _, first = np.unique(piece[faces[:, 0]], return_index=True)
     shape, box = Shape("mesh", mesh=mesh), (used.min(axis=0), used.max(axis=0))
     closed = vertices[faces] if class_index == 0 and mesh.is_watertight else None
