@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vprism_plan.perception import Observation
-from vprism_plan.perception.camera import invert_transform, project, transform_points
 from vprism_plan.viz._figures import hatched, legend, line, name_axes, new_figure, object_color
+from vprism_plan.world import visibility
 
 if TYPE_CHECKING:
     from vprism_plan.mapping import VPrismMap
@@ -170,18 +170,8 @@ def _slices(m: "VPrismMap", resolution: float) -> tuple[Slice, Slice]:
 
 def occluded(views: tuple[Observation, ...], points: np.ndarray) -> np.ndarray:
     """Return where no view saw the point and at least one saw something in front of it."""
-    behind, seen = np.zeros((2, len(points)), dtype=bool)
-    for view in views:
-        local = transform_points(invert_transform(view.pose), points)
-        pixels, depth = project(local, view.intrinsics)
-        column, row = np.round(np.clip(np.nan_to_num(pixels, nan=-1.0), -1, 1e6)).astype(int).T
-        height, width = view.shape
-        inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        measured = np.zeros(len(points))
-        measured[inside] = view.depth[row[inside], column[inside]]
-        behind |= inside & (measured > 0) & (depth > measured + _OCCLUDED)
-        seen |= inside & (measured > 0) & (depth <= measured + _OCCLUDED)
-    return behind & ~seen
+    status = visibility.classify_points(visibility.make_views(views, _OCCLUDED), points)
+    return np.asarray(status == visibility.OCCLUDED)
 
 
 def draw_slice(
