@@ -196,11 +196,7 @@ def _thinned(centers: Points, spacing: float) -> Float[np.ndarray, "m 3"]:
 
 
 def _stamp(
-    swept: Bool[np.ndarray, "x y z"],
-    low: Index,
-    centers: Float[np.ndarray, "m 3"],
-    radius: float,
-    resolution: float,
+    swept: Bool[np.ndarray, "x y z"], low: Index, centers: Points, radius: float, resolution: float
 ) -> None:
     """Mark the voxels whose centres lie in any of some balls of one radius."""
     span = np.arange(2 * (int(radius / resolution) + 1) + 1)

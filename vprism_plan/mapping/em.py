@@ -25,6 +25,10 @@ from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.factors import inverse, run_per_class
 from vprism_plan.mapping.features import BlockFeatures, FeatureSpace
 
+PerPoint = Float[np.ndarray, " n"]
+Classes = Int[np.ndarray, " n"]
+Logits = Float[np.ndarray, "n k"]
+
 
 @dataclass(frozen=True, eq=False)
 class Weights:
@@ -62,11 +66,6 @@ class Posterior:
         return out
 
 
-def every_member(space: FeatureSpace, classes: int) -> Bool[np.ndarray, "k m"]:
-    """Return the members where each class has all features."""
-    return np.ones((classes, space.size), dtype=bool)
-
-
 def diagonal_prior(
     space: FeatureSpace,
     mean: Float[np.ndarray, "m k"],
@@ -78,7 +77,8 @@ def diagonal_prior(
     `members` says which features each class has: all, if it is not given.
     """
     found = []
-    for k, held in enumerate(every_member(space, mean.shape[1]) if members is None else members):
+    every = np.ones(mean.shape[::-1], dtype=bool)
+    for k, held in enumerate(every if members is None else members):
         index = np.flatnonzero(held)
         own = space.part(index)
         precision, covariance = np.zeros((2, own.envelope_size))
@@ -96,29 +96,19 @@ def bouchard_lambda(xi: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shap
     return np.where(small, 0.125 - xi**2 / 96.0 + xi**4 / 960.0, np.tanh(0.5 * safe) / (4.0 * safe))
 
 
-def update_alpha(
-    mean: Float[np.ndarray, "n k"], weight: Float[np.ndarray, "n k"]
-) -> Float[np.ndarray, " n"]:
+def update_alpha(mean: Logits, weight: Logits) -> PerPoint:
     """Equation for alpha_i, as printed: a sum in the numerator; `weight` is lambda(xi)."""
     classes = mean.shape[1]
     return (0.5 * (0.5 * classes - 1.0) + (weight * mean).sum(axis=1)) / weight.sum(axis=1)
 
 
-def update_xi(
-    mean: Float[np.ndarray, "n k"],
-    variance: Float[np.ndarray, "n k"],
-    alpha: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, "n k"]:
+def update_xi(mean: Logits, variance: Logits, alpha: PerPoint) -> Logits:
     """Equation for xi_ik: the root of E[(z_ik - alpha_i)^2]."""
     return np.sqrt(variance + (mean - alpha[:, None]) ** 2)
 
 
 def expected_bound(
-    mean: Float[np.ndarray, "n k"],
-    variance: Float[np.ndarray, "n k"],
-    alpha: Float[np.ndarray, " n"],
-    xi: Float[np.ndarray, "n k"],
-    labels: Int[np.ndarray, " n"],
+    mean: Logits, variance: Logits, alpha: PerPoint, xi: Logits, labels: Classes
 ) -> float:
     """Sum over points of E_W[ln Q(y_i | x_i, W; alpha, xi)] (theorem 1)."""
     centred = mean - alpha[:, None]
@@ -144,7 +134,7 @@ class _Variational:
     """The parameters of Bouchard's bound, per point and per point and class."""
 
     alpha: Float[np.ndarray, " n"]
-    xi: Float[np.ndarray, "n k"]
+    xi: Logits
 
     def towards(self, step: "_Variational", factor: float) -> "_Variational":
         """Go `factor` times as far as from here to `step`."""
@@ -168,10 +158,7 @@ def _row_pieces(space: FeatureSpace, features: BlockFeatures) -> list[tuple[int,
 
 
 def _maximised(
-    prior: Sequence[Weights],
-    features: Sequence[BlockFeatures],
-    weight: Float[np.ndarray, "n k"],
-    linear: Float[np.ndarray, "n k"],
+    prior: Sequence[Weights], features: Sequence[BlockFeatures], weight: Logits, linear: Logits
 ) -> list[Weights]:
     """Return the posteriors whose precision is the prior's and sum_i weight_ik phi_i phi_i^T."""
     precisions = [own.precision.copy() for own in prior]
@@ -210,7 +197,7 @@ def _maximised(
 
 def logit_moments(
     classes: Sequence[Weights], features: Sequence[BlockFeatures]
-) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+) -> tuple[Logits, Logits]:
     """Return mean and variance of every training point's logits, in block order."""
     shape = len(features[0].order), len(classes)
     m, v = np.empty(shape), np.empty(shape)
@@ -239,7 +226,7 @@ def fit_weights(
     tolerance: float = 0.0,
     relaxation: float = 1.0,
     start_variance: float = 1.0,
-    offset: Float[np.ndarray, "n k"] | None = None,
+    offset: Logits | None = None,
 ) -> Posterior:
     """Run EM from xi = 1, alpha = 0 and return the posterior of all classes.
 
@@ -269,9 +256,7 @@ def fit_weights(
     guessed = offset is not None
     offset = np.zeros((1, classes)) if offset is None else offset[features.order]
 
-    def climbed(
-        m: Float[np.ndarray, "n k"], v: Float[np.ndarray, "n k"], start: Float[np.ndarray, "n k"]
-    ) -> _Variational:
+    def climbed(m: Logits, v: Logits, start: Logits) -> _Variational:
         """Return alpha and xi that raise the bound of logits with these moments."""
         xi = start
         for _ in range(variational_updates):

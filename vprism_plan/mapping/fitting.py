@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
 
 from vprism_plan._arguments import choice, is_whole
+from vprism_plan._shapes import Indices, Points
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import (
@@ -252,10 +253,7 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     fresh = weight_prior(space, config, old.n_classes)
     weights = expand_prior(old.space, old.posterior, space, fresh)
-    data = TrainingData(
-        data.points, class_of[data.classes], data.lower, data.upper, data.surface,
-        data.surface_ids, data.sunk,
-    )  # fmt: skip
+    data = replace(data, classes=class_of[data.classes])
     posterior = _learn(space, data, weights, config, None)
     warnings = tuple(dict.fromkeys([*old.warnings, *found]))
     return VPrismMap(config, old.object_ids, plane, views, space, posterior, old.seed, warnings)
@@ -328,9 +326,7 @@ def _marked_points(view: Observation) -> tuple[Float[np.ndarray, "n 3"], Int[np.
     return points, np.where(view.sees_robot[view.depth > 0], -1, labels)
 
 
-def _without_strays(
-    points: Float[np.ndarray, "n 3"], labels: Int[np.ndarray, " n"], share: float
-) -> tuple[Float[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
+def _without_strays(points: Points, labels: Indices, share: float) -> tuple[Points, Indices]:
     """Return one view's points and labels without flying pixels.
 
     Their rays go as well: they end in the shadow of what they fringe, and samples along
@@ -491,9 +487,7 @@ def _support_plane(views: Sequence[Observation], seed: int) -> Plane:
     return fit_plane(views[0], seed=seed)
 
 
-def _near_any(
-    points: Float[np.ndarray, "n 3"], centers: Float[np.ndarray, "c 3"], radius: float
-) -> Float[np.ndarray, "m 3"]:
+def _near_any(points: Points, centers: Points, radius: float) -> Points:
     """Keep the points within `radius` of a centre."""
     near = np.zeros(len(points), dtype=bool)
     for center in centers:
@@ -502,9 +496,7 @@ def _near_any(
     return points[near]
 
 
-def _farther_than(
-    points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"], distance: float
-) -> Float[np.ndarray, "k 3"]:
+def _farther_than(points: Points, others: Points, distance: float) -> Points:
     from scipy.spatial import cKDTree
 
     nearest, _ = cKDTree(others).query(points)

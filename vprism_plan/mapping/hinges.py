@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
+from vprism_plan._shapes import Chosen, Points
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.perception.camera import invert_transform, project, transform_points
 from vprism_plan.perception.observation import Observation
@@ -67,10 +68,7 @@ def surface_hinges(
 
 
 def local_features(
-    hinges: Float[np.ndarray, "h 3"],
-    lower: Float[np.ndarray, "c 3"],
-    upper: Float[np.ndarray, "c 3"],
-    reach: float | None,
+    hinges: Points, lower: Points, upper: Points, reach: float | None
 ) -> Bool[np.ndarray, "k m"]:
     """Return which features each class has: "empty" all, an object those that reach where it is.
 
@@ -126,9 +124,7 @@ def needed_nodes(
     return needed
 
 
-def _seen_through(
-    nodes: Float[np.ndarray, "n 3"], view: Observation, plane: Plane, radius: float
-) -> Bool[np.ndarray, " n"]:
+def _seen_through(nodes: Points, view: Observation, plane: Plane, radius: float) -> Chosen:
     """Whether every pixel around a node's image shows something behind the node's cell.
 
     The support surface counts as behind all that stands on it. A pixel without a return

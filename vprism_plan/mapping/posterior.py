@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`VPrismMap`: the fitted posterior and the questions it answers."""
 
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vprism_plan._kernels import mapping as kernels
+from vprism_plan._shapes import Points, Values
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
@@ -23,9 +25,11 @@ from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
 _SURE = 0.01 - MOST  # log-odds up to which a guess is as sure of nothing as it can be
+Logits = Float[np.ndarray, "n k"]
 MAX_LOG_ODDS = 40.0  # exp(-40) is 4e-18: nothing a float64 probability could still tell from 0
 
 
+@dataclass(eq=False, repr=False)
 class VPrismMap:
     """A probabilistic segmentation map of a tabletop scene (V-PRISM).
 
@@ -45,27 +49,15 @@ class VPrismMap:
         prior: what is added to the kernels' logits: a guess of the hidden side, or None.
     """
 
-    def __init__(
-        self,
-        config: MapConfig,
-        object_ids: tuple[int, ...],
-        plane: Plane,
-        views: tuple[Observation, ...],
-        space: FeatureSpace,
-        posterior: Posterior,
-        seed: int,
-        warnings: tuple[str, ...] = (),
-        prior: PriorField | None = None,
-    ) -> None:
-        self.config = config
-        self.object_ids = tuple(object_ids)
-        self.plane = plane
-        self.views = tuple(views)
-        self.space = space
-        self.posterior = posterior
-        self.seed = seed
-        self.warnings = tuple(warnings)
-        self.prior = prior
+    config: MapConfig
+    object_ids: tuple[int, ...]
+    plane: Plane
+    views: tuple[Observation, ...]
+    space: FeatureSpace
+    posterior: Posterior
+    seed: int
+    warnings: tuple[str, ...] = ()
+    prior: PriorField | None = None
 
     def __repr__(self) -> str:
         return (
@@ -196,9 +188,7 @@ class VPrismMap:
             return np.zeros(len(points), bool)
         return self.prior.covers(points) & (self.prior.at(points)[:, 1:].max(axis=1) > _SURE)
 
-    def logit_moments(
-        self, points: Any
-    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+    def logit_moments(self, points: Any) -> tuple[Logits, Logits]:
         """Return mean and variance of every class's logit at points (N, 3) m: two (N, K)."""
         mean, variance, _ = self._moments(_checked_points(points))
         return mean, variance
@@ -260,9 +250,7 @@ class VPrismMap:
         save_map(self, path)
 
     # ------------------------------------------------------------------ inside
-    def _moments(
-        self, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"], Float[np.ndarray, " n"]]:
+    def _moments(self, points: Points) -> tuple[Logits, Logits, Values]:
         """Return logit mean, variance and kernel mass; threads over blocks of near points."""
         n = len(points)
         mean, variance = np.empty((n, self.n_classes)), np.empty((n, self.n_classes))
@@ -305,9 +293,7 @@ class VPrismMap:
             return prediction.class_log_probabilities(*self._torch_moments(points)[:2])
         return self._normalised(*self._moments(_checked_points(points))[:2])
 
-    def _normalised(
-        self, mean: Float[np.ndarray, "n k"], variance: Float[np.ndarray, "n k"]
-    ) -> Float[np.ndarray, "n k"]:
+    def _normalised(self, mean: Logits, variance: Logits) -> Logits:
         out = np.empty_like(mean)
 
         def chunk(piece: slice) -> None:
@@ -323,31 +309,24 @@ class VPrismMap:
         _check_shape(tuple(points.shape))
         if not bool(torch.isfinite(points).all()):
             raise MapError("points hold NaN or infinity; every coordinate must be finite (m)")
-        if points.device.type != "cpu":
-            return self._guessed(points, *self._dense_moments(points))
-        if points.requires_grad and torch.is_grad_enabled():
-            exact = points.to(torch.float64)
+        kind = points.device.type
+        exact = points.to(torch.float32 if kind == "mps" else torch.float64)  # mps has no float64
+        if kind != "cpu":
+            moments = self._dense_moments(exact)
+        elif points.requires_grad and torch.is_grad_enabled():
             moments = prediction.LogitMoments.apply(exact, self.posterior.classes)
-            return self._guessed(exact, *moments)
-        array = np.ascontiguousarray(points.detach().to(torch.float64).numpy())
-        mean, variance, support = self._moments(array)
-        return torch.from_numpy(mean), torch.from_numpy(variance), torch.from_numpy(support)
-
-    def _guessed(
-        self, points: Tensor, mean: Tensor, variance: Tensor, support: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Add the prior's logits to those of the kernels."""
+        else:
+            mean, variance, support = self._moments(exact.detach().contiguous().numpy())
+            return torch.from_numpy(mean), torch.from_numpy(variance), torch.from_numpy(support)
+        mean, variance, support = moments
         if self.prior is not None:
-            mean = mean + self.prior.logits(points)
+            mean = mean + self.prior.logits(exact)
         return mean, variance, support
 
     def _dense_moments(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Evaluate on the points' own device with plain torch (float64 where it has that)."""
-        dtype = torch.float32 if points.device.type == "mps" else torch.float64
-        hinges, mean, covariance = self._device_arrays(points.device, dtype)
-        return prediction.dense_moments(
-            points.to(dtype), hinges, mean, covariance, self.space.gamma, self.space.radius
-        )
+        """Evaluate on the points' own device with plain torch."""
+        arrays = self._device_arrays(points.device, points.dtype)
+        return prediction.dense_moments(points, *arrays, self.space.gamma, self.space.radius)
 
     def _device_arrays(
         self, device: torch.device, dtype: torch.dtype

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
@@ -25,6 +25,7 @@ from torch.nn.functional import grid_sample
 
 from vprism_plan._arguments import number
 from vprism_plan._kernels import world as kernels
+from vprism_plan._shapes import Chosen, Indices, Points, Values
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.perception.camera import invert_transform, project, transform_points
@@ -252,9 +253,7 @@ class PriorField:
             inside |= (np.minimum(at, last - at) >= FADE).all(axis=1)
         return inside
 
-    def nearest(
-        self, points: Float[np.ndarray, "n 3"]
-    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    def nearest(self, points: Points) -> tuple[Indices, Points]:
         """Return the grid whose part that alone counts is nearest to each point (m), and where in
         it, voxels."""
         end = self.log_odds.shape[1] - 1 - FADE
@@ -340,9 +339,7 @@ def object_crops(
     return tuple(crops)
 
 
-def hidden_depth(
-    points: Float[np.ndarray, "n 3"], views: Sequence[Observation], window: int = 1
-) -> Float[np.ndarray, " n"]:
+def hidden_depth(points: Points, views: Sequence[Observation], window: int = 1) -> Values:
     """Return how far (m) points lie behind what the views saw, negative in front of it.
 
     Of several views the one that sees farthest counts. What no view shows, or only pixels
@@ -365,9 +362,7 @@ def hidden_depth(
     return behind
 
 
-def seen_through(
-    points: Float[np.ndarray, "n 3"], views: Sequence[Observation]
-) -> Bool[np.ndarray, " n"]:
+def seen_through(points: Points, views: Sequence[Observation]) -> Chosen:
     """Return where a view saw so far past points (m) that no guess puts anything there."""
     return hidden_depth(points, views, _WINDOW) < -_SEEN
 

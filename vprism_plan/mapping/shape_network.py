@@ -24,6 +24,7 @@ from torch.nn import functional
 
 from vprism_plan._files import reading
 from vprism_plan._resources import data_path
+from vprism_plan._shapes import Points
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.factors import run_per_class
 from vprism_plan.mapping.prior import FLAT_OCCUPANCY, SIDE, Crop, Guess, object_crops
@@ -166,9 +167,7 @@ class NetworkGuess:
         return np.column_stack([1.0 - occupied, occupied[:, None] * share])
 
 
-def _interpolated(
-    grids: Float[np.ndarray, "c x y z"], at: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "c n"]:
+def _interpolated(grids: Float[np.ndarray, "c x y z"], at: Points) -> Float[np.ndarray, "c n"]:
     return np.stack([map_coordinates(grid, at.T, order=1, mode="nearest") for grid in grids])
 
 

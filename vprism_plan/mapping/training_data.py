@@ -11,16 +11,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vprism_plan._kernels import mapping as kernels
+from vprism_plan._shapes import Chosen, Indices, Points, Vector
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.config import RaySampling
 
 
 def box_centers(
-    points: Float[np.ndarray, "n 3"],
-    labels: Int[np.ndarray, " n"],
-    object_ids: tuple[int, ...],
-    trim: float = 0.0,
-) -> tuple[Float[np.ndarray, "c 3"], Float[np.ndarray, "c 3"]]:
+    points: Points, labels: Indices, object_ids: tuple[int, ...], trim: float = 0.0
+) -> tuple[Points, Points]:
     """Return the lower and upper corners (m) of each object's axis-aligned box.
 
     Rows follow `object_ids`; the centres o_k of the paper are the means of the two.
@@ -88,12 +86,8 @@ def sample_below_plane(
 
 
 def sunk_objects(
-    points: Float[np.ndarray, "n 3"],
-    labels: Int[np.ndarray, " n"],
-    object_ids: tuple[int, ...],
-    normal: Float[np.ndarray, " 3"],
-    offset: float,
-) -> Bool[np.ndarray, " c"]:
+    points: Points, labels: Indices, object_ids: tuple[int, ...], normal: Vector, offset: float
+) -> Chosen:
     """Which objects lie lower than the plane: on a bench beside the table, in a bin.
 
     A fifth of what was seen of them is more than 2 cm (noise at table range) below it.
@@ -102,12 +96,7 @@ def sunk_objects(
     return np.array([np.quantile(height, 0.2) < -0.02 for height in heights], dtype=bool)
 
 
-def outside_boxes(
-    points: Float[np.ndarray, "n 3"],
-    lower: Float[np.ndarray, "c 3"],
-    upper: Float[np.ndarray, "c 3"],
-    room: float,
-) -> Bool[np.ndarray, " n"]:
+def outside_boxes(points: Points, lower: Points, upper: Points, room: float) -> Chosen:
     """Which points (m) keep `room` (m) along an axis from every box."""
     outside = np.ones(len(points), dtype=bool)
     for low, high in zip(lower - room, upper + room, strict=True):
@@ -115,9 +104,7 @@ def outside_boxes(
     return outside
 
 
-def sample_in_front(
-    points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, " 3"], distance: float
-) -> Float[np.ndarray, "m 3"]:
+def sample_in_front(points: Points, origin: Vector, distance: float) -> Points:
     """Points `distance` (m) before each point on its ray; nearer ones to the camera give none."""
     rays = points - origin
     length = np.linalg.norm(rays, axis=1)
@@ -125,9 +112,7 @@ def sample_in_front(
     return points[far] - rays[far] * (distance / length[far])[:, None]
 
 
-def grid_subsample(
-    points: Float[np.ndarray, "n 3"], resolution: float | None
-) -> Float[np.ndarray, "m 3"]:
+def grid_subsample(points: Points, resolution: float | None) -> Points:
     """Return the barycentre of the points in each occupied cell of `resolution` (m).
 
     Cells sit at world multiples of the resolution; the result is ordered by cell, so

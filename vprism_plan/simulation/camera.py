@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from vprism_plan._shapes import Image, Vector
+
 MAX_RANGE = 3.0  # metres of depth beyond which the simulated sensor reports nothing
 _PALETTE = np.frombuffer(  # label 0: table and clutter
     bytes.fromhex("b2b0aad6604d4393c35aae61e3aa3c9970ab50bebec878a0968c466e6ec8e68c64"), np.uint8
@@ -26,9 +28,7 @@ class Camera:
     height: int = 480
 
     @classmethod
-    def look_at(
-        cls, eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], **kwargs: object
-    ) -> "Camera":
+    def look_at(cls, eye: Vector, target: Vector, **kwargs: object) -> "Camera":
         """Return a camera at `eye` that looks at `target`, image rows level with the table."""
         forward = np.asarray(target, dtype=np.float64) - eye
         forward /= np.linalg.norm(forward)
@@ -41,12 +41,7 @@ class Camera:
 
     @classmethod
     def orbit(
-        cls,
-        target: Float[np.ndarray, "3"],
-        distance: float,
-        azimuth: float,
-        elevation: float,
-        **kwargs: object,
+        cls, target: Vector, distance: float, azimuth: float, elevation: float, **kwargs: object
     ) -> "Camera":
         """Return a camera at `distance` metres from `target`, angles in radians."""
         level = np.cos(elevation)
@@ -105,13 +100,7 @@ class DepthNoise:
     flying_probability: float = 0.15
     quantum: float = 0.001  # metres
 
-    def apply(
-        self,
-        depth: Float[np.ndarray, "h w"],
-        cosine: Float[np.ndarray, "h w"],
-        pixel_angle: float,
-        seed: int,
-    ) -> Float[np.ndarray, "h w"]:
+    def apply(self, depth: Image, cosine: Image, pixel_angle: float, seed: int) -> Image:
         """Return a noisy copy of a clean depth image (0 = no return stays 0).
 
         Args:

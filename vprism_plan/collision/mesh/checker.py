@@ -429,8 +429,7 @@ class MeshChecker(explain.Checker):
 
     def _link_gap(self, i: int, j: int) -> float:
         """Distance between two solids of the robot; 0 where a mesh is touched."""
-        a, b = self.placed.shape(i), self.placed.shape(j)
-        return fcl.gap(a, b) if a.hollow or b.hollow else fcl.signed_gap(a, b)
+        return fcl.signed_gap(self.placed.shape(i), self.placed.shape(j))
 
     def _gap(self, i: int, b: int, owner: int) -> float:
         """Distance of solid i to body b, padding aside; `owner` as of `_owners`."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._shapes import Vector
 from vprism_plan.errors import MissingDependencyError
 
 # A point to FCL, which has none: a ball too small to matter, metres.
@@ -104,15 +105,13 @@ def gap(a: Shape, b: Shape) -> float:
 
 
 def signed_gap(a: Shape, b: Shape) -> float:
-    """Distance between two solids (no meshes), metres; minus the way out where they overlap. FCL's
-    own signed distance errs by up to 0.2 mm; its distance and its depth do not."""
-    touch = deepest_touch(a, b)
+    """Distance between two shapes, metres; where they touch, minus the way out of solids, 0 of
+    meshes. FCL's own signed distance errs by up to 0.2 mm; its distance and its depth do not."""
+    touch = None if a.hollow or b.hollow else deepest_touch(a, b)
     return gap(a, b) if touch is None else touch[0]
 
 
-def point_distance(
-    shape: Shape, point: Float[np.ndarray, "3"]
-) -> tuple[float, Float[np.ndarray, "3"]]:
+def point_distance(shape: Shape, point: Vector) -> tuple[float, Vector]:
     """Distance from a point to a mesh's surface, metres, and the nearest point on it (world)."""
     module, ball = fcl(), _ball(point, _POINT_RADIUS)
     # The mesh goes first: FCL swaps the two otherwise, and the points with them.
@@ -144,9 +143,7 @@ def nearest_points(a: Shape, b: Shape) -> tuple[Float[np.ndarray, "3"], Float[np
     return first, second
 
 
-def deepest_touch(
-    a: Shape, b: Shape
-) -> tuple[float, Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
+def deepest_touch(a: Shape, b: Shape) -> tuple[float, Vector, Vector] | None:
     """Return where two shapes intersect most, or None: minus the depth (metres), where, and the
     unit vector that leads from the first to the second, world.
 

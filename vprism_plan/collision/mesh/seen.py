@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.spatial import cKDTree
 
+from vprism_plan._shapes import Indices
 from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
@@ -208,9 +209,7 @@ class HiddenSpace:
         hidden[rows[known]] = False
 
 
-def _samples(
-    placed: PlacedSolids,
-) -> tuple[Int[np.ndarray, "m"], Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+def _samples(placed: PlacedSolids) -> tuple[Indices, Points, Points]:
     """Points of the moving links' surfaces: their solids, places and normals, link frame."""
     moving = np.flatnonzero(placed.moving)
     drawn = [drawn_points(placed.solids[i].triangles, _DRAWN) for i in moving]
