@@ -258,46 +258,30 @@ class Objective:
         return named
 
 
+@dataclass(eq=False)
 class Candidates:
-    """The trajectories of one query; see `optimize`.
+    """The trajectories of one query; see `optimize`."""
 
-    Args:
-        checker: whose joint limits hold.
-        seeds: where to begin.
-        cost: the module that is minimised.
-        guard: level from 1 -> the module that repairs add at that level; None: no repairs.
-        method: key of `MINIMISERS`.
-        limits: per seed and round.
-        repairs: rounds after the first, per bound on risk.
-        clearance_step: distance between the samples of a reported clearance.
-        kept: clearance, metres, that a path must keep; None: what the checker asks for.
-    """
+    checker: CheckerLike  # whose joint limits hold
+    seeds: Seeds  # where to begin
+    cost: Any  # the module that is minimised
+    guard: Callable[[int], Any] | None  # level from 1 -> what repairs add at it; None: no repairs
+    method: str  # key of `MINIMISERS`
+    limits: Limits  # per seed and round
+    repairs: int  # rounds after the first, per bound on risk
+    clearance_step: float  # distance between the samples of a reported clearance
+    kept: float | None  # clearance, metres, that a path must keep; None: what the checker asks for
 
-    def __init__(
-        self,
-        checker: CheckerLike,
-        seeds: Seeds,
-        *,
-        cost: Any,
-        guard: Callable[[int], Any] | None,
-        method: str,
-        limits: Limits,
-        repairs: int,
-        clearance_step: float,
-        kept: float | None,
-    ) -> None:
-        self.robot, self.seeds = checker.robot, seeds
-        self.guard, self.method, self.limits = guard, method, limits
-        self.repairs, self.clearance_step, self.kept = repairs, clearance_step, kept
-        self.objective = Objective(cost, seeds.q)
-        count = len(seeds.q)
+    def __post_init__(self) -> None:
+        self.objective = Objective(self.cost, self.seeds.q)
+        count = len(self.seeds.q)
         self.iterations = np.zeros(count, dtype=np.int64)
         self.refused = [""] * count
         self.edges = np.full(count, -1)
         self.rounds = self.motion_checks = self.repaired = 0
         self.optimization_time = self.verification_time = 0.0
         self.minimum: Minimum | None = None
-        self.ended = seeds.q
+        self.ended = self.seeds.q
         self._guard: Any = None
         self._asked: list[tuple[np.ndarray, int | None]] = []
 
@@ -348,7 +332,7 @@ class Candidates:
         with torch.no_grad():
             q = self.objective.trajectories(minimum.x, torch.arange(len(z))).numpy()
         inside = q.copy()
-        inside[:, 1:-1] = _within_limits(self.robot, q[:, 1:-1])
+        inside[:, 1:-1] = _within_limits(self.checker.robot, q[:, 1:-1])
         clipped = np.flatnonzero((inside != q).any(axis=(1, 2)))
         if len(clipped):  # what is handed out costs something else than what was minimised
             rows = torch.from_numpy(clipped)
