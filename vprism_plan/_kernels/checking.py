@@ -29,7 +29,7 @@ _INF = np.inf
 # nanometre; at 1e16 radians nothing of them is left.
 FARTHEST = 1e6
 _MOST_CHECKS = 1_000_000  # configurations of one edge, seconds; an edge of so many is refused
-_MAX_TURN = 0.5  # radians per step of a sampled path: keeps the bend between samples small
+MAX_TURN = 0.5  # radians per step of a sampled path: keeps the bend between samples small
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -350,7 +350,7 @@ def _pair_gap(pair, T, lc, C, placed, rf, ri, enough):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _scratch(ri):
+def scratch(ri):
     """Room for frame poses, link centres, sphere centres and which links are placed."""
     n_links = ri[2]
     C = np.empty((3, ri[1]))
@@ -358,7 +358,7 @@ def _scratch(ri):
 
 
 @njit(cache=True, nogil=True)
-def _pose(q, rf, ri, T, lc, placed):
+def pose_links(q, rf, ri, T, lc, placed):
     """Place frames and link bounding spheres; no sphere is placed yet."""
     fk_frames(q, rf, ri, T)
     for link in range(ri[2]):
@@ -370,7 +370,7 @@ def _pose(q, rf, ri, T, lc, placed):
 def _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed):
     if not within_limits(q, rf, ri):
         return False
-    _pose(q, rf, ri, T, lc, placed)
+    pose_links(q, rf, ri, T, lc, placed)
     if not _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
         return False
     return _self_clear(T, lc, C, placed, rf, ri)
@@ -379,7 +379,7 @@ def _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed):
 @njit(cache=True, nogil=True)
 def is_valid(q, rf, ri, D, E, wf):
     """Whether a configuration is inside its limits and clear of the world and itself."""
-    T, lc, C, placed = _scratch(ri)
+    T, lc, C, placed = scratch(ri)
     return _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed)
 
 
@@ -396,10 +396,10 @@ def is_valid_batch(Q, rf, ri, D, E, wf, out):
 @njit(cache=True, nogil=True)
 def clearance_batch(Q, rf, ri, D, E, wf, world, own):
     """Fill world (n,) and own (n,): distance bounds to the world and between links, metres."""
-    T, lc, C, placed = _scratch(ri)
+    T, lc, C, placed = scratch(ri)
     li = ri[9]
     for n in range(Q.shape[0]):
-        _pose(Q[n], rf, ri, T, lc, placed)
+        pose_links(Q[n], rf, ri, T, lc, placed)
         best = _INF
         for link in range(ri[2]):
             if ri[li + 4 * link + 3] >= 0:
@@ -508,7 +508,7 @@ def _safe_span(q, rf, ri, D, E, wf, link_rate, pair_rate, longest, T, lc, C, pla
     """
     if not within_limits(q, rf, ri):
         return -1.0
-    _pose(q, rf, ri, T, lc, placed)
+    pose_links(q, rf, ri, T, lc, placed)
     margin = wf[6]
     li = ri[9]
     span = longest
@@ -561,7 +561,7 @@ def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
     pair_rate = np.empty(ri[3])
     total = motion_rates(delta, rf, ri, link_rate, pair_rate)
     stats[3] = total
-    T, lc, C, placed = _scratch(ri)
+    T, lc, C, placed = scratch(ri)
     q = np.empty(dof)
     lo = np.empty(128)
     hi = np.empty(128)
@@ -623,7 +623,7 @@ def check_path(P, rf, ri, D, E, wf, min_motion, stats):
 
 
 @njit(cache=True, nogil=True)
-def _turned(delta, rf, ri):
+def turned_by(delta, rf, ri):
     """Sum of the angles by which the joints turn, mimicking ones included."""
     total = 0.0
     for f in range(1, ri[0]):
@@ -642,7 +642,7 @@ def count_steps(P, rf, ri, spacing, steps):
     for e in range(P.shape[0] - 1):
         delta = P[e + 1] - P[e]
         motion_rates(delta, rf, ri, link_rate, pair_rate)
-        fastest = _turned(delta, rf, ri) * spacing / _MAX_TURN
+        fastest = turned_by(delta, rf, ri) * spacing / MAX_TURN
         for link in range(ri[2]):
             fastest = max(fastest, link_rate[link])
         steps[e] = max(1, int(np.ceil(fastest / spacing)))
@@ -673,7 +673,7 @@ def place_path(P, steps, rf, ri, C, slack):
     for e in range(P.shape[0] - 1):
         delta = P[e + 1] - P[e]
         motion_rates(delta, rf, ri, link_rate, pair_rate)
-        turned = _turned(delta, rf, ri) / steps[e]
+        turned = turned_by(delta, rf, ri) / steps[e]
         for t in range(steps[e] + 1):
             for j in range(dof):
                 q[j] = P[e, j] + (t / steps[e]) * delta[j]

@@ -11,36 +11,26 @@ The robot (`rf`, `ri`) is packed as in `vprism_plan._kernels.robot`, the draws' 
 
 import numpy as np
 
+from vprism_plan._kernels.checking import MAX_TURN, motion_rates, turned_by
 from vprism_plan._kernels.jit import njit
 from vprism_plan._kernels.risk import mark_ball, touch_ball
 from vprism_plan._kernels.robot import fk_frames
 
-_MAX_TURN = 0.5  # radians per step, as in `checking`
-
 
 @njit(cache=True, nogil=True)
 def plan_steps(qa, qb, rf, ri, spacing, delta, link_rate):
-    """Fill delta (dof,), qb - qa, and link_rate (n_links,), a
-    bound on the way of any sphere centre of a link along the motion, metres.
+    """Fill delta (dof,), qb - qa, and link_rate as `motion_rates` does.
 
     Returns the number of steps, so that in one no centre moves more than `spacing` and the
     joints turn by at most half a radian together; the largest of the rates; the whole turn.
     """
-    for j in range(ri[4]):
-        delta[j] = qb[j] - qa[j]
-    turned = 0.0
-    link_rate[:] = 0.0
-    n_links = ri[2]
-    for f in range(1, ri[0]):
-        speed = abs(rf[ri[16] + 14 * f + 12] * delta[ri[ri[8] + 3 * f + 2]])
-        if ri[ri[8] + 3 * f + 1] == 1:
-            turned += speed
-        for link in range(n_links):
-            link_rate[link] += speed * max(rf[ri[20] + f * n_links + link], 0.0)
+    delta[:] = qb - qa
+    motion_rates(delta, rf, ri, link_rate, np.empty(ri[3]))
+    turned = turned_by(delta, rf, ri)
     farthest = 0.0
-    for link in range(n_links):
+    for link in range(ri[2]):
         farthest = max(farthest, link_rate[link])
-    steps = max(int(np.ceil(farthest / spacing)), int(np.ceil(turned / _MAX_TURN)))
+    steps = max(int(np.ceil(farthest / spacing)), int(np.ceil(turned / MAX_TURN)))
     return steps, farthest, turned
 
 

@@ -17,23 +17,11 @@ import math
 
 import numpy as np
 
+from vprism_plan._kernels.checking import pose_links, scratch
 from vprism_plan._kernels.jit import njit
-from vprism_plan._kernels.robot import fk_frames, place_link
+from vprism_plan._kernels.robot import fk_frames, place_link, place_spheres
 
 _SHORT = 1e-6  # metres; as in vprism_plan.trajopt.cost
-
-
-@njit(cache=True, nogil=True)
-def _frames(q, rf, ri, T, L):
-    """Fill T (frames, 12) with poses, L (links, 3) with the centres of the balls round links."""
-    fk_frames(q, rf, ri, T)
-    for link in range(ri[2]):
-        f = ri[ri[9] + 4 * link]
-        o = ri[18] + 4 * link
-        for r in range(3):
-            L[link, r] = T[f, 9 + r]
-            for c in range(3):
-                L[link, r] += T[f, 3 * r + c] * rf[o + c]
 
 
 @njit(cache=True, nogil=True)
@@ -120,12 +108,9 @@ def divide(Q, rf, ri, turns, spacing, max_turn, most, fixed):
     edges = len(Q) - 1
     parts = np.full(edges + 1, max(fixed, 1))
     if fixed == 0:
-        T = np.empty((ri[0], 12))
         C = np.empty((2, 3, ri[1]))
         for e in range(edges + 1):
-            fk_frames(Q[e], rf, ri, T)
-            for link in range(ri[2]):
-                place_link(link, T, rf, ri, C[e & 1])
+            place_spheres(Q[e], rf, ri, C[e & 1])
             if e > 0:
                 square = 0.0
                 for s in range(ri[1]):
@@ -280,14 +265,13 @@ def _over(wf, o, x, y, z):
 def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, G, active):
     """Fill the slope of each sphere's potential at its centre; return the sum of them all.
 
-    Links that are not active are wholly beyond the margin.
+    Links that are not marked active are wholly beyond the margin.
     """
     margin = wf[6]
     total = 0.0
     for link in range(ri[2]):
         li = ri[9] + 4 * link
         rule = ri[li + 3]
-        active[link] = False
         if rule < 0:
             continue
         # The spline at a sphere's centre lies between nodes at most 2.6 steps from it, a node is
@@ -325,15 +309,12 @@ def _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, G, active):
 @njit(cache=True, nogil=True)
 def clearance(q, edge, fraction, weight, rf, ri, V, E, wf, radii, grown, grad):
     """Obstacle cost of one trajectory over time; adds its gradient to grad (T, dof)."""
-    T = np.empty((ri[0], 12))
-    L = np.empty((ri[2], 3))
-    C = np.empty((3, ri[1]))
+    T, L, C, active = scratch(ri)
     G = np.zeros((3, ri[1]))
-    active = np.zeros(ri[2], np.bool_)
     slope = np.empty(3)
     total = 0.0
     for i in range(len(q)):
-        _frames(q[i], rf, ri, T, L)
+        pose_links(q[i], rf, ri, T, L, active)
         value = _obstacle_terms(T, L, C, rf, ri, V, E, wf, radii, grown, slope, G, active)
         if value > 0.0:
             total += weight[i] * value
@@ -450,7 +431,6 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
     ro = ri[17] + 3 * ri[1]
     bo = ri[18]
     total = 0.0
-    active[:] = False
     for pair in range(ri[3]):
         a = ri[ri[10] + 2 * pair]
         b = ri[ri[10] + 2 * pair + 1]
@@ -499,14 +479,11 @@ def _pair_terms(T, C, L, active, rf, ri, margin, kept, F):
 @njit(cache=True, nogil=True)
 def self_collision(q, edge, fraction, weight, rf, ri, margin, kept, grad):
     """Cost of links near each other of one trajectory; adds its gradient to grad (T, dof)."""
-    T = np.empty((ri[0], 12))
-    C = np.empty((3, ri[1]))
-    L = np.empty((ri[2], 3))
+    T, L, C, active = scratch(ri)
     F = np.zeros((3, ri[1]))
-    active = np.zeros(ri[2], np.bool_)
     total = 0.0
     for i in range(len(q)):
-        _frames(q[i], rf, ri, T, L)
+        pose_links(q[i], rf, ri, T, L, active)
         value = _pair_terms(T, C, L, active, rf, ri, margin, kept, F)
         if value > 0.0:
             total += weight[i] * value
