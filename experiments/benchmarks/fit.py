@@ -71,7 +71,7 @@ def main() -> None:
     rng = np.random.default_rng(args.seed)
     plane = fit_plane(obs)
     data = training_data([obs], obs.object_ids, plane, config, rng)
-    hinges = sorted_hinges(new_hinges(data, obs.object_ids, (obs,), plane, config, rng))
+    hinges = sorted_hinges(new_hinges(data, (obs,), plane, config, rng))
     classes = len(obs.object_ids) + 1
     print(
         f"{classes - 1} objects, {len(data.points)} points, {len(hinges)} hinge points", flush=True

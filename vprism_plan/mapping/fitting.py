@@ -4,7 +4,7 @@
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
@@ -64,8 +64,6 @@ class TrainingData:
         points: (N, 3) m, world; thinned.
         classes: (N,) 0 is empty, k is `object_ids[k - 1]`.
         lower, upper: (C, 3) corners of the objects' boxes, m.
-        surface: the object points among `points`.
-        surface_ids: their labels.
         sunk: which objects lie lower than the support plane.
     """
 
@@ -73,9 +71,12 @@ class TrainingData:
     classes: Int64[np.ndarray, " n"]
     lower: Float[np.ndarray, "c 3"]
     upper: Float[np.ndarray, "c 3"]
-    surface: Float[np.ndarray, "s 3"]
-    surface_ids: Int64[np.ndarray, " s"]
     sunk: Bool[np.ndarray, " c"]
+
+    @property
+    def surface(self) -> Points:
+        """The object points among `points`."""
+        return self.points[self.classes > 0]
 
 
 def fit_map(
@@ -114,30 +115,30 @@ def _fit(
     config, views, ids, plane, space = (
         problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
     )  # fmt: skip
-    field = None
+    data, field = problem.data, None
     if prior is not None and config.prior_hidden_variance is not None:
 
-        def under_table(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-            sunk, room = problem.data.sunk, config.object_radius
-            low, high = problem.data.lower[sunk], problem.data.upper[sunk]
-            return (plane.signed_distance(points) < 0.0) & outside_boxes(points, low, high, room)
+        def empty(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+            low, high = data.lower[data.sunk], data.upper[data.sunk]
+            under_table = outside_boxes(points, low, high, config.object_radius)
+            under_table &= plane.signed_distance(points) < 0.0
+            return under_table | seen_through(points, views)
 
         field = prior_field(
             _guessing(prior)(views, ids, plane),
             object_crops(views, ids, plane),
-            lambda points: under_table(points) | seen_through(points, views),
+            empty,
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
             own=not isinstance(prior, str),
         )
         depth = hidden_depth(space.hinges, views)
         variance = correction_variances(space, config, depth)
         mean = np.zeros((space.size, len(ids) + 1))
-        low, high = problem.data.lower, problem.data.upper
-        members = local_features(space.hinges, low, high, config.class_reach)
+        members = local_features(space.hinges, data.lower, data.upper, config.class_reach)
         weights = diagonal_prior(space, mean, variance, members)
     else:
         weights = weight_prior(space, config, len(ids) + 1)
-    posterior = _learn(space, problem.data, weights, config, field)
+    posterior = _learn(space, data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
         tuple(dict.fromkeys([*known, *problem.warnings])), field,
@@ -156,8 +157,7 @@ def _guessing(prior: Any) -> Prior:
             f"prior is a {type(prior).__name__}; give 'shape', None, a MeshPrior, or a function "
             "of (views, object_ids, plane)"
         )
-    asked: Prior = prior
-    return asked
+    return cast(Prior, prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ def learning_problem(
     object_ids = _object_ids(views)
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
-    hinges, used, coarser = _hinges_within_budget(data, object_ids, views, plane, config, rng)
+    hinges, used, coarser = _hinges_within_budget(data, views, plane, config, rng)
     space = FeatureSpace(sorted_hinges(hinges), used.gamma, used.cutoff_radius)
     warnings = (*warnings, *_without_return(views, object_ids), *coarser)
     return LearningProblem(used, views, object_ids, plane, data, space, warnings)
@@ -242,7 +242,7 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
-    candidates = new_hinges(data, seen, views, plane, config, rng)
+    candidates = new_hinges(data, views, plane, config, rng)
     # New ground is where the old lattice did not reach: nodes it already has stay its own.
     added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
     hinges = np.concatenate([old.space.hinges, added])
@@ -303,15 +303,11 @@ def training_data(
     if len(free) > room:
         logger.warning("%d empty points thinned at random to max_points", len(free))
         free = free[np.sort(rng.permutation(len(free))[:room])]
-    surface = np.concatenate(surfaces)
-    index = np.repeat(np.arange(len(object_ids)), counts)
     return TrainingData(
-        np.concatenate([free, surface]),
-        np.concatenate([np.zeros(len(free), np.int64), index + 1]),
+        np.concatenate([free, *surfaces]),
+        np.repeat(np.arange(1 + len(object_ids)), [len(free), *counts]),
         lower,
         upper,
-        surface,
-        np.asarray(object_ids, np.int64)[index],
         sunk,
     )
 
@@ -343,12 +339,11 @@ def _without_strays(points: Points, labels: Indices, share: float) -> tuple[Poin
 
 def new_hinges(
     data: TrainingData,
-    object_ids: tuple[int, ...],
     views: Sequence[Observation],
     plane: Plane,
     config: MapConfig,
     rng: np.random.Generator,
-) -> Float[np.ndarray, "h 3"]:
+) -> Points:
     """Return lattice and surface hinge points of the training data (m, world)."""
     lattice = lattice_hinges(data.lower, data.upper, plane.normal, plane.offset, config, data.sunk)
     if config.hinge_reach is not None:
@@ -358,18 +353,18 @@ def new_hinges(
         lower, upper = data.lower[data.sunk], data.upper[data.sunk]
         needed |= ~outside_boxes(lattice, lower, upper, config.hinge_margin)
         lattice = lattice[needed]
-    surface = surface_hinges(data.surface, data.surface_ids, object_ids, config.surface_hinges, rng)
+    owners, objects = data.classes[data.classes > 0], tuple(range(1, 1 + len(data.lower)))
+    surface = surface_hinges(data.surface, owners, objects, config.surface_hinges, rng)
     return np.concatenate([lattice, surface])
 
 
 def _hinges_within_budget(
     data: TrainingData,
-    object_ids: tuple[int, ...],
     views: Sequence[Observation],
     plane: Plane,
     config: MapConfig,
     rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "h 3"], MapConfig, list[str]]:
+) -> tuple[Points, MapConfig, list[str]]:
     """Return at most `max_hinges` hinge points, the parameters that make so few, and a warning
     where those are not `config`: spacing and kernel grow together, so that the prior stays.
 
@@ -382,7 +377,7 @@ def _hinges_within_budget(
         listed = float((extent / config.hinge_spacing + 1.0).prod(axis=1).sum())
         count, budget = listed, _CROWDED * config.max_hinges
         if listed <= budget:
-            hinges = new_hinges(data, object_ids, views, plane, config, rng)
+            hinges = new_hinges(data, views, plane, config, rng)
             count, budget = len(hinges), float(config.max_hinges)
         needed = needed or int(count)
         if count <= budget:

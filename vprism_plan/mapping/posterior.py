@@ -316,8 +316,8 @@ class VPrismMap:
         elif points.requires_grad and torch.is_grad_enabled():
             moments = prediction.LogitMoments.apply(exact, self.posterior.classes)
         else:
-            mean, variance, support = self._moments(exact.detach().contiguous().numpy())
-            return torch.from_numpy(mean), torch.from_numpy(variance), torch.from_numpy(support)
+            m = self._moments(exact.detach().contiguous().numpy())
+            return torch.from_numpy(m[0]), torch.from_numpy(m[1]), torch.from_numpy(m[2])
         mean, variance, support = moments
         if self.prior is not None:
             mean = mean + self.prior.logits(exact)

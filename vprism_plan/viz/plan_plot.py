@@ -158,8 +158,6 @@ def resample(path: Float[np.ndarray, "t dof"], count: int) -> Float[np.ndarray, 
     path = np.asarray(path, dtype=np.float64)
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    if along[-1] == 0.0:
-        return np.repeat(path[:1], count, axis=0)
     at = np.linspace(0.0, along[-1], count)
     return np.stack([np.interp(at, along, column) for column in path.T], axis=1)
 

@@ -87,12 +87,8 @@ def densified(
         Configurations, and their places: number of the edge plus the fraction of it.
     """
     steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    whole = float(steps.sum())
-    places = [np.zeros(1)]
-    for edge, step in enumerate(steps):
-        n = max(1, round(count * float(step) / whole)) if whole > 0 else 1
-        places.append(edge + np.arange(1, n + 1) / n)
-    at = np.concatenate(places)
+    pieces = np.maximum(1.0, np.rint(count * steps / max(float(steps.sum()), 1e-9)))
+    at = np.concatenate([[0.0], *(edge + np.arange(1, n + 1) / n for edge, n in enumerate(pieces))])
     number = np.arange(len(path))
     return np.stack([np.interp(at, number, column) for column in path.T], axis=1), at
 
