@@ -8,6 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int64
+from scipy.spatial import cKDTree
 
 from vprism_plan._arguments import choice, is_whole
 from vprism_plan._shapes import Indices, Points
@@ -244,7 +245,8 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     data = training_data((observation,), seen, plane, config, rng)
     candidates = new_hinges(data, views, plane, config, rng)
     # New ground is where the old lattice did not reach: nodes it already has stay its own.
-    added = _farther_than(candidates, old.space.hinges, 0.5 * config.hinge_spacing)
+    nearest, _ = cKDTree(old.space.hinges).query(candidates)
+    added = candidates[nearest > 0.5 * config.hinge_spacing]
     hinges = np.concatenate([old.space.hinges, added])
     if len(hinges) > config.max_hinges:
         logger.info("all %d views are fitted together, on a coarser lattice", len(views))
@@ -489,10 +491,3 @@ def _near_any(points: Points, centers: Points, radius: float) -> Points:
         away = points - center
         near |= np.einsum("na,na->n", away, away) <= radius**2
     return points[near]
-
-
-def _farther_than(points: Points, others: Points, distance: float) -> Points:
-    from scipy.spatial import cKDTree
-
-    nearest, _ = cKDTree(others).query(points)
-    return points[nearest > distance]

@@ -22,18 +22,13 @@ if TYPE_CHECKING:
     from vprism_plan.mapping.em import Weights
 
 
-def log_scores(mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
-    """Return log q_k, not normalised."""
-    gap = mean[:, None, :] - mean[:, :, None]  # [n, k, i] = m_i - m_k
-    spread = 1.0 + (math.pi / 8.0) * (variance[:, None, :] + variance[:, :, None])
-    return -torch.logsumexp(gap / torch.sqrt(spread), dim=2)
-
-
 def class_log_probabilities(
     mean: Float[Tensor, "n k"], variance: Float[Tensor, "n k"]
 ) -> Float[Tensor, "n k"]:
     """Return the logarithm of the normalised prediction."""
-    return torch.log_softmax(log_scores(mean, variance), dim=1)
+    gap = mean[:, None, :] - mean[:, :, None]  # [n, k, i] = m_i - m_k
+    spread = 1.0 + (math.pi / 8.0) * (variance[:, None, :] + variance[:, :, None])
+    return torch.log_softmax(-torch.logsumexp(gap / torch.sqrt(spread), dim=2), dim=1)
 
 
 class _NoSecondDerivative(torch.autograd.Function):

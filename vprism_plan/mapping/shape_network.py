@@ -24,7 +24,6 @@ from torch.nn import functional
 
 from vprism_plan._files import reading
 from vprism_plan._resources import data_path
-from vprism_plan._shapes import Points
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.factors import run_per_class
 from vprism_plan.mapping.prior import FLAT_OCCUPANCY, SIDE, Crop, Guess, object_crops
@@ -153,7 +152,10 @@ class NetworkGuess:
                 continue  # farther than its corners: who asks of one crop pays for few others
             at = crop.to_voxels(points)
             rows = np.flatnonzero(((at >= 0.0) & (at <= SIDE - 1.0)).all(axis=1))
-            own[rows, k], other = expit(_interpolated(grids, at[rows]))
+            where = at[rows].T
+            own[rows, k], other = (
+                expit(map_coordinates(grid, where, order=1, mode="nearest")) for grid in grids
+            )
             # The nearer to the middle of a crop, the more its network saw around a voxel.
             trust = 0.01 + (0.5 * SIDE - np.abs(at[rows] - 0.5 * (SIDE - 1)).max(axis=1)) ** 2
             anything[rows] += trust * other
@@ -165,10 +167,6 @@ class NetworkGuess:
         # What is no object of its own is some object's: the likeliest ones take the rest.
         share = (own + 1e-4) / (together + 1e-4 * own.shape[1])[:, None]
         return np.column_stack([1.0 - occupied, occupied[:, None] * share])
-
-
-def _interpolated(grids: Float[np.ndarray, "c x y z"], at: Points) -> Float[np.ndarray, "c n"]:
-    return np.stack([map_coordinates(grid, at.T, order=1, mode="nearest") for grid in grids])
 
 
 class ShapePrior:

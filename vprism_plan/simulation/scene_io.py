@@ -21,17 +21,6 @@ _FORMAT = "vprism_plan scene, version 1"
 GROUND_TRUTH = "ground_truth.json"
 
 
-def _to_dict(scene: Scene) -> dict[str, Any]:
-    return {
-        "format": _FORMAT,
-        "name": scene.name,
-        "seed": scene.seed,
-        "labels": list(scene.labels),
-        "solids": [solid.to_dict() for solid in scene.solids],
-        **view_to_dict(scene.camera, scene.noise),
-    }
-
-
 def view_to_dict(camera: Camera, noise: DepthNoise | None) -> dict[str, Any]:
     """Return `camera` and `noise`, JSON-ready and exact."""
     pose, intrinsics = camera.T_world_camera.tolist(), camera.intrinsics.tolist()
@@ -49,15 +38,6 @@ def view_from_dict(data: dict[str, Any]) -> tuple[Camera, DepthNoise | None]:
     return Camera(**camera), None if data["noise"] is None else DepthNoise(**data["noise"])
 
 
-def _from_dict(data: dict[str, Any]) -> Scene:
-    if data.get("format") != _FORMAT:
-        raise ObservationError(
-            f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
-        )
-    solids, labels = tuple(map(solid_from_dict, data["solids"])), tuple(data["labels"])
-    return Scene(solids, labels, *view_from_dict(data), data["seed"], data["name"])
-
-
 def save_scene(scene: Scene, path: str | Path) -> None:
     """Write the observation (folder, or `.npz` by suffix) and the ground truth beside it.
 
@@ -69,7 +49,15 @@ def save_scene(scene: Scene, path: str | Path) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_observation(scene.observation, path)
-    write_text(_truth_path(path), json.dumps(_to_dict(scene), indent=1) + "\n")
+    truth = {
+        "format": _FORMAT,
+        "name": scene.name,
+        "seed": scene.seed,
+        "labels": list(scene.labels),
+        "solids": [solid.to_dict() for solid in scene.solids],
+        **view_to_dict(scene.camera, scene.noise),
+    }
+    write_text(_truth_path(path), json.dumps(truth, indent=1) + "\n")
 
 
 def load_ground_truth(path: str | Path) -> Scene:
@@ -78,7 +66,13 @@ def load_ground_truth(path: str | Path) -> Scene:
     if not truth.is_file():
         raise ObservationError(f"{truth} does not exist; a scene is written by save_scene")
     with reading(truth, "the truth of a scene", ObservationError):
-        return _from_dict(read_json(truth, ObservationError))
+        data = read_json(truth, ObservationError)
+        if data.get("format") != _FORMAT:
+            raise ObservationError(
+                f"ground truth has format {data.get('format')!r}; this version reads {_FORMAT!r}"
+            )
+        solids, labels = tuple(map(solid_from_dict, data["solids"])), tuple(data["labels"])
+        return Scene(solids, labels, *view_from_dict(data), data["seed"], data["name"])
 
 
 def _truth_path(path: Path) -> Path:
