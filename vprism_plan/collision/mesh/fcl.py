@@ -47,17 +47,12 @@ class Shape:
         self.center = np.zeros(3)  # where its own origin is, world frame
 
     def _geometry(self, mesh: Any) -> Any:
-        module = fcl()
         if self.kind != "mesh":
-            return getattr(module, self.kind.capitalize())(*map(float, self.size))
-        vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
-        faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)
+            return getattr(fcl(), self.kind.capitalize())(*map(float, self.size))
+        from trimesh.collision import mesh_to_BVH
+
         self.normals = np.asarray(mesh.face_normals)
-        model = module.BVHModel()
-        model.beginModel(len(vertices), len(faces))
-        model.addSubModel(vertices, faces)
-        model.endModel()
-        return model
+        return mesh_to_BVH(mesh)
 
     @property
     def hollow(self) -> bool:
