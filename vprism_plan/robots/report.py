@@ -179,6 +179,22 @@ def robot_warnings(robot: Any) -> tuple[str, ...]:
     return tuple(found)
 
 
+def read_warnings(model: Any, semantics: Any, chosen: Any) -> tuple[str, ...]:
+    """What is odd about the files of a robot."""
+    found, file = [*semantics.warnings], chosen.file
+    if file.missing:
+        found.append(f"{file.source} names what {model.name} lacks, left out: {file.missing}")
+    still = [joint.name for joint in model.joints if joint.kind in ("floating", "planar")]
+    if still:
+        found.append(f"floating or planar joints stand still, as base_pose says: {still}")
+    bare = [name for name, link in model.links.items() if link.seen and name not in chosen.rows]
+    bare = [name for name in bare if not (model.links[name].primitives or model.links[name].meshes)]
+    if bare:
+        named = ", ".join(bare)
+        found.append(f"links with only a <visual> are not checked: {named}; add <collision>")
+    return tuple(found)
+
+
 def _link_report(robot: Any, name: str) -> LinkReport:
     solids, meshes, rows = _of_link(robot, name)
     missing = tuple(mesh.filename for mesh in meshes if mesh.path is None)
