@@ -216,8 +216,9 @@ def _description(command: _Parser) -> None:
     command.take("--srdf SRDF", Path, text)
     text = "collision spheres: YAML of this package, a robot file of cuRobo, or XRDF"
     command.take("--spheres FILE", Path, text)
-    text = "SRDF group whose joints make a configuration; default as the file of spheres says, "
-    text += 'else "arm", else all joints'
+    text = (
+        'SRDF group whose joints make a configuration; default: of the file of spheres, "arm", all'
+    )
     command.take("--group NAME", str, text)
     text = (
         "folders that hold the packages of package:// names; folders above the URDF and "

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,14 +23,13 @@ from vprism_plan.robots import changes, kinematics, pairs, surfaces
 from vprism_plan.robots.changes import Held
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
 from vprism_plan.robots.kinematics import Attachment, KinematicArrays, TorchKinematics
-from vprism_plan.robots.report import RobotReport, read_warnings, robot_report, robot_warnings
+from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
 from vprism_plan.robots.sphere_files import ChosenSpheres, link_spheres, write_spheres
 from vprism_plan.robots.sphere_fit import SphereFit
 from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, lock_values, write_srdf
 from vprism_plan.robots.urdf import RobotModel, load_model
 
 READY = "ready"
-_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +149,11 @@ class Robot:
                 mapping, or None: ``<stem>_spheres.yml`` beside the URDF, else spheres that
                 enclose the URDF's own geometry (spheres are taken as they are). "fit" does
                 so in any case.
-            base_pose: (4, 4) pose of the root link in the world; None is identity. It is in
-                the place of a floating or planar joint.
+            base_pose: (4, 4) pose of the root link in the world, whatever floating or planar
+                joint holds it there; None is identity.
             joints: Joints of a configuration, in the order wanted. None takes the joints of
                 cuRobo's or XRDF's ``cspace``, else the SRDF group "arm" if there is one, else
-                all joints that move and do not mimic another. Those whose limits are equal
-                are locked.
+                all that move (lower < upper) and do not mimic another.
             locked: Values for joints not in ``joints``. Default for each: that of cuRobo's or
                 XRDF's file, else its value in the SRDF (state "ready" first, then file
                 order), else 0 or the limit next to it.
@@ -251,11 +248,6 @@ class Robot:
     def dof(self) -> int:
         """Number of joints in a configuration."""
         return len(self.joint_names)
-
-    @property
-    def links_with_meshes(self) -> tuple[str, ...]:
-        """Links with collision meshes: what ``geometry`` holds of them is not the whole link."""
-        return tuple(self.meshes_as_read)
 
     @property
     def lower(self) -> Float[np.ndarray, "dof"]:
@@ -410,8 +402,7 @@ class Robot:
     def warnings(self) -> tuple[str, ...]:
         """What is usable but odd: in the files, links that stand out of their spheres, or that
         nothing checks."""
-        parts = self._parts
-        return (*read_warnings(parts.model, parts.semantics, parts.chosen), *robot_warnings(self))
+        return robot_warnings(self)
 
     def values(self, joints: Any) -> Float[np.ndarray, "dof"]:
         """A configuration from joint values by name, which do wherever a configuration is taken.
@@ -563,7 +554,7 @@ class Robot:
         Buffers of a file of cuRobo or XRDF are written as padding, apart from the radii;
         that of :meth:`with_padding` is not written.
         """
-        bare = {name: np.empty((0, 4)) for name in (*self.geometry, *self.links_with_meshes)}
+        bare = {name: np.empty((0, 4)) for name in (*self.geometry, *self.meshes)}
         note = f"Collision spheres of {self.name}, metres, in link frames."
         file = self._parts.chosen.file
         if file.padding or file.buffer:

@@ -276,9 +276,9 @@ def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
             )
         entry, named = _yaml(path), f"'{path}'"
     spheres = _table(entry, named, off=True)
-    cspace, of_joint = kinematics.get("cspace") or {}, f"{source}: the value of joint"
+    cspace, of_joint = kinematics.get("cspace") or {}, f"{source} gives joint"
     joints, tool = cspace.get("joint_names") or (), kinematics.get("ee_link")
-    locked = _values(kinematics.get("lock_joints"), (), of_joint)
+    locked = finite_values(kinematics.get("lock_joints"), (), of_joint)
     return SphereTable(
         source,
         spheres,
@@ -288,8 +288,8 @@ def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
         ignored=_pairs(kinematics.get("self_collision_ignore")),
         joints=tuple(name for name in joints if name not in locked),
         locked=locked,
-        rest=_values(cspace.get("retract_config"), joints, of_joint),
-        accelerations=_values(cspace.get("max_acceleration"), joints, of_joint),
+        rest=finite_values(cspace.get("retract_config"), joints, of_joint),
+        accelerations=finite_values(cspace.get("max_acceleration"), joints, of_joint),
         tool=tool and str(tool),
     )
 
@@ -310,7 +310,7 @@ def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
     spheres = _table(chosen["spheres"], source, off=True)
     cspace, own = content.get("cspace") or {}, content.get("self_collision") or {}
     joints, tools = cspace.get("joint_names") or (), content.get("tool_frames") or ()
-    of_joint = f"{source}: the value of joint"
+    of_joint = f"{source} gives joint"
     return SphereTable(
         source,
         spheres,
@@ -319,8 +319,8 @@ def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
         buffer=_padding(own.get("buffer_distance"), spheres, source),
         ignored=_pairs(own.get("ignore")),
         joints=tuple(joints),
-        rest=_values(content.get("default_joint_positions"), (), of_joint),
-        accelerations=_values(cspace.get("acceleration_limits"), joints, of_joint),
+        rest=finite_values(content.get("default_joint_positions"), (), of_joint),
+        accelerations=finite_values(cspace.get("acceleration_limits"), joints, of_joint),
         tool=str(tools[0]) if tools else None,
     )
 
@@ -332,7 +332,7 @@ def _pairs(entry: Mapping[str, Sequence[str]] | None) -> frozenset[frozenset[str
     return frozenset(frozenset((a, b)) for a, others in entry.items() for b in others if a != b)
 
 
-def _values(entry: Any, names: Sequence[str], what: str) -> dict[str, float]:
+def finite_values(entry: Any, names: Sequence[str], what: str) -> dict[str, float]:
     """Value of each joint or link; from a table, one number for all, or one each."""
     if entry is not None and not isinstance(entry, Mapping):
         several = entry if isinstance(entry, list | tuple) else [entry] * len(names)
@@ -344,12 +344,12 @@ def _values(entry: Any, names: Sequence[str], what: str) -> dict[str, float]:
         except (TypeError, ValueError):
             values[str(name)] = math.nan
         if not math.isfinite(values[str(name)]):
-            raise RobotError(f"{what} '{name}' is {value!r}; give a finite number (m, rad)")
+            raise RobotError(f"{what} '{name}' the value {value!r}; give one finite number")
     return values
 
 
 def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]:
-    grown = _values(buffer, tuple(spheres), f"{source}: the buffer of link")
+    grown = finite_values(buffer, tuple(spheres), f"{source} gives the buffer of link")
     return {link: pad for link, pad in grown.items() if pad > 0.0 and len(spheres.get(link, ()))}
 
 

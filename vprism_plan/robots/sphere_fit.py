@@ -133,10 +133,9 @@ def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Spheres:
     key = hashlib.sha256(program + f"{libraries} {tolerance!r} {max_spheres} ".encode() + corners)
     folder = cache_folder("spheres")
     file = None if folder is None else folder / key.hexdigest()
-    if file is not None and file.is_file():
-        content = file.read_bytes()
-        if hashlib.sha256(content[32:]).digest() == content[:32]:
-            return np.frombuffer(content[32:]).reshape(-1, 4)
+    content = file.read_bytes() if file is not None and file.is_file() else b""
+    if hashlib.sha256(content[32:]).digest() == content[:32]:
+        return np.frombuffer(content[32:]).reshape(-1, 4)
     surface = with_hull(np.frombuffer(corners).reshape(-1, 3, 3))
     rows = np.ascontiguousarray(_fitted(surface, tolerance, max_spheres))
     if file is not None:

@@ -16,6 +16,7 @@ import numpy as np
 from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
+from vprism_plan.robots.sphere_files import finite_values
 from vprism_plan.robots.urdf import LIMIT_TOLERANCE, RobotModel
 
 Names = dict[str, tuple[str, ...]]
@@ -146,20 +147,11 @@ def _states(
 ) -> dict[tuple[str, str], dict[str, float]]:
     states: dict[tuple[str, str], dict[str, float]] = {}
     for state in root.findall("group_state"):
-        values: dict[str, float] = {}
-        for joint in state.findall("joint"):
-            name = joint.get("name", "")
-            if not _has("joint", name, model.joint_map, missing) or not model.joint_map[name].moves:
-                continue
-            try:
-                values[name] = float(joint.get("value", ""))
-            except ValueError:
-                values[name] = math.nan
-            if not math.isfinite(values[name]):
-                where = f"state '{state.get('name')}' in '{path}'"
-                found = f"gives joint '{name}' the value {joint.get('value')!r}"
-                raise RobotError(f"{where} {found}; give one finite number")
-        states[state.get("name", ""), state.get("group", "")] = values
+        values = {joint.get("name", ""): joint.get("value", "") for joint in state.findall("joint")}
+        values = {n: v for n, v in values.items() if _has("joint", n, model.joint_map, missing)}
+        values = {n: v for n, v in values.items() if model.joint_map[n].moves}
+        found = f"state '{state.get('name')}' in '{path}' gives joint"
+        states[state.get("name", ""), state.get("group", "")] = finite_values(values, (), found)
     return states
 
 
