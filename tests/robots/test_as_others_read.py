@@ -13,6 +13,7 @@ from small_urdfs import LIMIT, LINK, TWO, chain, joint
 
 from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import PlanningError, RobotError
+from vprism_plan.planning import plan
 from vprism_plan.planning._inverse_kinematics import find_tip
 from vprism_plan.robots import Robot
 from vprism_plan.robots.report import enclosed
@@ -159,6 +160,8 @@ def test_values_by_name_do_wherever_a_configuration_does(write, values):
     checker = CollisionChecker(far_away(), robot)
     assert checker.explain(values).valid
     assert checker.check_motion(values, [0.3, 0.4])
+    planned = plan(checker, values, {"j1": 0.3, "j2": 0.4})
+    np.testing.assert_array_equal(planned.path[[0, -1]], [[0.1, 0.2], [0.3, 0.4]])
 
 
 def test_a_missing_joint_is_named(write):

@@ -197,7 +197,7 @@ def test_a_whole_robot_file_is_the_robot(tmp_path, write, kind):
         write(FOUR), spheres=whole(tmp_path, kind), joints=["j1"], locked={"finger": 0.0}
     )
     assert other.locked == {"j2": 0.5, "finger": 0.0}
-    timed = time_parameterize(robot, [[0.0, 0.0], [0.5, 0.0]], velocity_limits=[1.0, 1.0])
+    timed = time_parameterize(robot, np.array([[0.0, 0.0], [0.5, 0.0]]), velocity_limits=[1.0, 1.0])
     assert timed.duration == pytest.approx(0.5 / 1.0 + 1.0 / 3.0)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from vprism_plan._arguments import number
 from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, joint_values
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, Named, joint_values
 from vprism_plan.robots.pairs import pair_room
 from vprism_plan.robots.urdf import LIMIT_TOLERANCE
 from vprism_plan.world.grid import Vector
@@ -31,8 +31,8 @@ Waypoints = Float[np.ndarray, "_ _"]
 _HEADER = 24
 MARGIN = 6  # where the floats of a packed world hold the clearance to keep
 AT_MOST = 200_000  # configurations that one query may ask about
-# An array, a tensor, a list or a tuple.
-Numbers = ArrayLike | Sequence[Any]
+# An array, a tensor, a list or a tuple; of one configuration also values by name.
+Numbers = ArrayLike | Sequence[Any] | Named
 
 # Kernel view of a world: distances at nodes and in blocks (metres, float32), (rules, x, y, z)
 # each, and the grid, plane and margin data.

@@ -27,6 +27,7 @@ from vprism_plan.planning.planners import planner_kind, planners
 from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, SecondOpinion
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import CLOCKS, SearchRequest
+from vprism_plan.robots.kinematics import Named
 
 _log = logging.getLogger(__name__)
 
@@ -35,7 +36,6 @@ Answer = Callable[[CheckerLike, float, tuple[float, ...]], PlanResult]
 
 MARGINS = (0.02, 0.01, 0.005, 0.0)  # metres beyond the checker's own, in turn
 _BEYOND = " beyond the checker's margin"
-_FARTHEST_NUDGE = 0.1  # radians or metres
 _WIDER = 0.1  # of the time limit for each that is not the last
 _RISKIER = 0.2  # of the time limit to find out how risky what is too risky is, ...
 _BOUNDS = (0.25, 0.5, 0.75, 0.95)  # ... by these bounds, in turn
@@ -43,8 +43,8 @@ _BOUNDS = (0.25, 0.5, 0.75, 0.95)  # ... by these bounds, in turn
 
 def plan(
     checker: CheckerLike,
-    start: ArrayLike | Sequence[float],
-    goal: ArrayLike | Sequence[float] | ReachRegion,
+    start: ArrayLike | Sequence[float] | Named,
+    goal: ArrayLike | Sequence[float] | Named | ReachRegion,
     planner: str = "RRTConnect",
     time_limit: float | int = 5.0,
     seed: int = 0,
@@ -62,7 +62,7 @@ def plan(
     objective: str | RiskObjective = "length",
     warm_start: bool = True,
     margins: Sequence[float] | str | None = "auto",
-    nudge: float = 0.005,
+    nudge: float | int = 0.005,
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
@@ -76,7 +76,7 @@ def plan(
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
-        start: start configuration (dof,), radians or metres.
+        start: start configuration (dof,), radians or metres, or joint values by name.
         goal: goal configuration (dof,); or several, (g, dof), of which any will do; or the
             pose (4, 4) of the end effector in the world frame (for a robot of four joints: if
             its last row is 0 0 0 1); or a `ReachRegion`. `report.refused_goals` says which
@@ -138,7 +138,7 @@ def plan(
     number("simplify_time", simplify_time, 0.0, unit="s", finite=False, error=PlanningError)
     if second_opinion is not None:
         _require_same_robot(second_opinion, checker)
-    number("nudge", nudge, 0.0, _FARTHEST_NUDGE, error=PlanningError)
+    number("nudge", nudge, 0.0, 0.1, error=PlanningError)
     q_start = configuration(start, checker.robot, "start")
     q_start, moved = free_start(checker, q_start, nudge, request.seed)
     now = CLOCKS[clock]

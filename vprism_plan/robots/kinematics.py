@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -359,6 +359,17 @@ def outside_limits(robot: Any, q: Float[np.ndarray, "... dof"]) -> Bool[np.ndarr
     return np.asarray((low | high) & ~np.asarray(robot.continuous, dtype=bool))
 
 
+@runtime_checkable
+class JointState(Protocol):
+    """Joint values by name, such as a ROS message of that type."""
+
+    name: Any
+    position: Any
+
+
+Named = Mapping[str, Any] | JointState
+
+
 def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
     """Return joint values as a fresh float64 array, C-contiguous and writeable.
 
@@ -370,7 +381,7 @@ def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values.copy(order="C")
-    if hasattr(values, "name") and hasattr(values, "position"):  # a JointState
+    if isinstance(values, JointState):
         values = dict(zip(values.name, values.position, strict=True))
     if isinstance(values, Mapping):
         missing = [name for name in robot.joint_names if name not in values]

@@ -404,15 +404,11 @@ class Robot:
         nothing checks."""
         return robot_warnings(self)
 
-    def values(self, joints: Any) -> Float[np.ndarray, "dof"]:
+    def values(self, joints: kinematics.Named) -> Float[np.ndarray, "dof"]:
         """A configuration from joint values by name, which do wherever a configuration is taken.
 
-        Args:
-            joints: A mapping, or what has ``name`` and ``position`` as ROS' JointState: radians
-                or metres. Other joints than those of ``joint_names`` are passed over.
-
-        Raises:
-            RobotError: A joint is missing, or a value is no finite number.
+        Joints that are not in ``joint_names`` are passed over. RobotError if one is missing, or
+        no finite number.
         """
         return self.check_configuration(joints)
 

@@ -78,10 +78,6 @@ def link_spheres(
             "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
             "on purpose"
         )
-    emptied = [name for name, rows in known.items() if not len(rows) and name in solid]
-    if emptied and table.foreign:
-        odd = "%s leaves the links %s without spheres; they have geometry that is not checked"
-        _logger.warning(odd, table.source, emptied)
     rest = _from_geometry(model, bare, fit)
     if rest.rows:
         _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
