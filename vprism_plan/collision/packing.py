@@ -68,10 +68,9 @@ def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
     if arrays.kind[frame] != KIND_PRISMATIC:
         return 0.0
     joint = int(arrays.q_index[frame])
-    ends = arrays.q_mult[frame] * np.array(
-        [arrays.lower[joint] - LIMIT_TOLERANCE, arrays.upper[joint] + LIMIT_TOLERANCE]
-    )
-    return float(np.max(np.abs(ends + arrays.q_offset[frame])))
+    ends = np.array([arrays.lower[joint], arrays.upper[joint]])
+    ends += (-LIMIT_TOLERANCE, LIMIT_TOLERANCE)
+    return float(np.max(np.abs(arrays.q_mult[frame] * ends + arrays.q_offset[frame])))
 
 
 def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:

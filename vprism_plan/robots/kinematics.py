@@ -269,6 +269,7 @@ def reach_bound(arrays: KinematicArrays) -> float:
         reach[f] = reach[arrays.parent[f]] + np.linalg.norm(arrays.t_off[f])
         if arrays.kind[f] == KIND_PRISMATIC:
             ends = np.array([arrays.lower[arrays.q_index[f]], arrays.upper[arrays.q_index[f]]])
+            ends += (-LIMIT_TOLERANCE, LIMIT_TOLERANCE)
             reach[f] += np.abs(arrays.q_mult[f] * ends + arrays.q_offset[f]).max()
     outer = np.linalg.norm(arrays.sphere_center, axis=1) + arrays.sphere_radius
     return float((reach[arrays.sphere_frame] + outer).max())

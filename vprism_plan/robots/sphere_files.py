@@ -116,10 +116,7 @@ def _from_geometry(model: RobotModel, links: Iterable[str], fit: SphereFit) -> C
 # -------------------------------------------------------------------------------------- files
 @dataclass(frozen=True)
 class SphereTable:
-    """What a file or a mapping says of spheres; links that a foreign one leaves out are fitted.
-
-    Another program's may say more: how a configuration is made, and what collides with what.
-    """
+    """What a file or a mapping says of spheres; links that a foreign one leaves out are fitted."""
 
     source: str  # for messages
     spheres: LinkSpheres  # those that are switched off left out; a link may have none

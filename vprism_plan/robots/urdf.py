@@ -77,11 +77,8 @@ class RobotModel:
     @property
     def movable(self) -> tuple[str, ...]:
         """Those of them with any room between their limits; the others are locked."""
-        return tuple(
-            name
-            for name in self.actuated
-            if self.joint_map[name].lower < self.joint_map[name].upper
-        )
+        joints = self.joint_map
+        return tuple(n for n in self.actuated if joints[n].lower < joints[n].upper)
 
     @functools.cached_property
     def moved(self) -> frozenset[str]:
