@@ -155,6 +155,46 @@ def test_a_bad_question_is_bad_input(arguments, words, saved_map, repository, ca
     assert re.search(words, err[0])
 
 
+def test_query_and_plan_take_what_belongs_to_a_urdf(saved_map, repository, tmp_path, capsys):
+    """Meshes in a folder of packages, spheres and an SRDF elsewhere, a group of its joints."""
+    import trimesh
+
+    urdf = planar(repository).read_text().replace('<robot name="planar3"', '<robot name="mine"')
+    mesh = (
+        '<collision><geometry><mesh filename="package://mine/m.stl"/></geometry></collision></link>'
+    )
+    own = tmp_path / "there" / "mine.urdf"
+    own.parent.mkdir()
+    own.write_text(urdf.replace("</link>", mesh, 1))
+    (tmp_path / "packages" / "mine").mkdir(parents=True)
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(tmp_path / "packages" / "mine" / "m.stl")
+    srdf = tmp_path / "other.srdf"
+    srdf.write_text(
+        planar(repository)
+        .with_suffix(".srdf")
+        .read_text()
+        .replace(
+            "</robot>",
+            '<group name="two"><joint name="joint3"/><joint name="joint1"/></group></robot>',
+        )
+    )
+    spheres = repository / "urdf" / "planar3_spheres.yml"
+    options = ["--robot", own, "--srdf", srdf, "--spheres", spheres, "--group", "two"]
+    options += ["--package-dirs", tmp_path / "packages", "--base-xyz", "3", "0", "-0.1", "--json"]
+    code, out, _ = call(capsys, "query", saved_map, *options, "--q", "0.1", "0.2")
+    said = json.loads(out)
+    assert code == 0
+    assert said["joint_names"] == ["joint3", "joint1"]
+    assert not any("mesh" in text for text in said["warnings"])
+    ends = ["--start", "0", "0.2", "--goal", "0", "0.5", "--output", tmp_path / "out"]
+    code, out, _ = call(capsys, "plan", saved_map, *options, *ends)
+    assert code == 0
+    assert json.loads(out)["joint_names"] == ["joint3", "joint1"]
+    code, _, err = call(capsys, "query", saved_map, *options, "--group", "none", "--q", "0")
+    assert code == 2
+    assert "'none'" in err[0]
+
+
 def test_an_unknown_robot_file_is_bad_input(saved_map, tmp_path, capsys):
     code, _, err = call(
         capsys, "query", saved_map, "--robot", tmp_path / "none.urdf", "--q", "0", "0"

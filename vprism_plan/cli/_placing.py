@@ -87,6 +87,14 @@ def candidate_bases(
             yield around.base_pose([*xy, around.table], yaw)
 
 
+def read_robot(command: Command, **options: Any) -> "Robot":
+    """Return the robot of a command's options; `options` as of `Robot.from_urdf` go before."""
+    from vprism_plan.robots import Robot
+
+    named = {name: getattr(command, name) for name in ("srdf", "spheres", "group", "package_dirs")}
+    return Robot.from_urdf(command.robot, **named | options)
+
+
 def places(
     command: Command, robot: "Robot", world: "World", around: Surroundings
 ) -> Iterator[tuple[int, "Robot"]]:

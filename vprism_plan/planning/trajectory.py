@@ -78,10 +78,11 @@ def time_parameterize(
     """Time a path so that no joint exceeds its velocity or acceleration limit.
 
     Args:
-        robot: brings `joint_names` and the default `velocity_limits`.
+        robot: brings `joint_names` and the default limits.
         path: waypoints (t, dof), at least one, as in `PlanResult.path`.
         velocity_limits: (dof,) rad/s or m/s; the robot's own if None.
-        acceleration_limits: (dof,) per s^2; None: each joint is at full speed in half a second.
+        acceleration_limits: (dof,) per s^2; None: the robot's own, else a joint is at full speed
+            in half a second.
         scale: share of both limits to use, more than 0 and at most 1.
 
     Returns:
@@ -101,6 +102,9 @@ def time_parameterize(
     given = robot.velocity_limits if velocity_limits is None else velocity_limits
     speed = _limits("velocity", given, names)
     push = speed / _SECONDS_TO_FULL_SPEED
+    stated = getattr(robot, "acceleration_limits", None)
+    if acceleration_limits is None and stated is not None:
+        acceleration_limits = np.where(np.isfinite(stated), stated, push)
     if acceleration_limits is not None:
         push = _limits("acceleration", acceleration_limits, names)
 
