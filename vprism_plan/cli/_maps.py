@@ -21,7 +21,7 @@ def fit_view(
     """Fit a map to a view; segment it if it has no labels, align it if it has no pose.
 
     Raises:
-        ObservationError: the view cannot be used, or shows no object.
+        ObservationError: the view cannot be used.
     """
     from vprism_plan.mapping import MapConfig, fit_map
     from vprism_plan.perception import align_to_table, load_observation, segment_tabletop
@@ -31,7 +31,6 @@ def fit_view(
     if obs.labels is None:
         with console.stage("segment"):
             obs = segment_tabletop(obs, seed=seed)
-    obs.require_objects()
     if not obs.posed:
         with console.stage("align"):
             obs = align_to_table(obs, seed=seed)
@@ -60,7 +59,7 @@ def describe_map(m: "VPrismMap") -> dict[str, Any]:
         "objects": objects,
         "hinge_points": len(m.hinge_points),
         "iterations": len(m.history),
-        "bound": float(m.history[-1]),
+        "bound": float(m.history[-1]) if m.history else None,
         "views": len(m.views),
         "plane": {"normal": m.plane.normal, "offset": m.plane.offset},
     }
@@ -88,7 +87,7 @@ def run_map(command: Command, console: Console) -> int:
     }
     how = " (segmented from geometry)" if segmented else ""
     lines = [
-        f"{len(m.object_ids)} objects{how}: {', '.join(map(str, m.object_ids))}",
+        f"{len(m.object_ids)} objects{how}: {', '.join(map(str, m.object_ids))}".rstrip(": "),
         f"{len(m.hinge_points)} hinge points, {len(m.history)} iterations",
         console.time_line(),
         f"wrote {output} ({size / 1e6:.1f} MB)",

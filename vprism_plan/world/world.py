@@ -3,7 +3,7 @@
 
 import logging
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -13,8 +13,9 @@ from jaxtyping import Float, UInt8
 
 from vprism_plan._threads import beside
 from vprism_plan.errors import WorldError
+from vprism_plan.mapping.posterior import nothing
 from vprism_plan.world import visibility
-from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, WorldConfig
+from vprism_plan.world.config import HalfSpace, Known, KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
@@ -60,10 +61,15 @@ class World:
     the policies say.
 
     Args:
-        map: a `VPrismMap`.
+        map: a `VPrismMap`; None where there is none and no camera: then nothing but known geometry
+            is an obstacle, and all other space is free (`unobserved="occupied"`: all that lies
+            outside of the grid is an obstacle, and all in it).
         config: resolution, level, policies and known geometry.
+        known: more known geometry, beside that of the configuration; an empty list says that there
+            is none.
 
     Attributes:
+        map: that map; one without objects and views where none was given.
         grid: nodes of the field.
         field: distance to objects, background, occluded or unobserved space (by policy) and known
             geometry.
@@ -74,14 +80,25 @@ class World:
         timings: seconds per step of the bake; some steps run at the same time.
 
     Raises:
-        WorldError: the map says "occupied" without evidence, or the grid is too large.
+        WorldError: the map says "occupied" without evidence, the grid is too large, or there is
+            neither a map nor known geometry.
     """
 
     def __init__(
-        self, map: Any, config: WorldConfig | None = None, _traced: LevelSet | None = None
+        self,
+        map: Any = None,
+        config: WorldConfig | None = None,
+        known: Iterable[Known] | None = None,
+        _traced: LevelSet | None = None,
     ) -> None:
-        self.map = map
-        self.config = WorldConfig() if config is None else config
+        config = WorldConfig() if config is None else config
+        if map is None and known is None and not config.known:
+            raise WorldError(
+                "a World is made of a map (fit_map) or of known=[Box(...), ...]; known=[] says "
+                "that there is no obstacle at all"
+            )
+        self.map = map = nothing() if map is None else map
+        self.config = replace(config, known=(*config.known, *known)) if known else config
         self.timings: dict[str, float] = {}
         self._evidence = Evidence(map, self.config)
         self._bounded = self._evidence.bounded
@@ -122,9 +139,9 @@ class World:
         self._unseen: Lattice = self._timed(
             "seen", self._evidence.with_seen, marks, self.grid, self._objects.distance
         )
-        known = self._timed("known geometry", self._known_distances, solids)
-        known += self._solid_distances(self._support, SUPPORT, self.grid)
-        self._known: NodeDistances = combine(known, self.grid)
+        sure = self._timed("known geometry", self._known_distances, solids)
+        sure += self._solid_distances(self._support, SUPPORT, self.grid)
+        self._known: NodeDistances = combine(sure, self.grid)
         self._others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
         self.field: DistanceField = self._timed(
             "combine", self._field, [self._objects, *self._others, self._known]
@@ -439,7 +456,8 @@ class World:
         if lower <= RIM:
             return self
         if self._lowered is None:
-            self._lowered = World(self.map, replace(self.config, support="seen"), self._level_set)
+            lowered = replace(self.config, support="seen")
+            self._lowered = World(self.map, lowered, _traced=self._level_set)
             self._lowered._said = (
                 f"the robot's base stands {lower:.2f} m below the support plane, so the support "
                 f"surface counts only where it was seen and {RIM:g} m around; "
