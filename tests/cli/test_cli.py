@@ -279,3 +279,30 @@ def test_warmup_compiles_each_half_that_is_not_cached_in_a_process_of_its_own(ca
     monkeypatch.setattr("vprism_plan._kernels.jit.is_cached", lambda kernel: True)
     assert call(capsys, "warmup")[0] == 0
     assert len(started) == 4
+
+
+@pytest.mark.parametrize("suffix", [".bt", ".scene", ".npz", ".glb"])
+def test_a_map_is_exported_by_its_suffix(suffix, saved_map, tmp_path, capsys):
+    if suffix == ".bt":
+        pytest.importorskip("pyoctomap")
+    file = tmp_path / "out" / f"world{suffix}"
+    box = ("--bounds", -0.1, -0.1, -0.02, 0.1, 0.1, 0.2)
+    code, out, err = call(capsys, "export", saved_map, "--output", file, *box, "--json")
+    assert (code, err) == (0, [])
+    assert json.loads(out)["bytes"] == file.stat().st_size > 100
+    code, _, err = call(capsys, "export", saved_map, "--output", tmp_path / "world.dae", *box)
+    assert code == 2
+    assert ".scene" in err[0]
+
+
+def test_a_trajectory_is_exported_for_ros(tmp_path, capsys):
+    from vprism_plan.planning.trajectory import Trajectory, write_message
+
+    motion = Trajectory(np.array([0.0, 1.5]), np.array([[0.0], [1.0]]), np.zeros((2, 1)))
+    write_message(tmp_path / "trajectory.json", ["slide"], motion)
+    code, *_ = call(
+        capsys, "export", tmp_path / "trajectory.json", "--output", tmp_path / "t.yaml",
+        "--frame-id", "map",
+    )  # fmt: skip
+    assert code == 0
+    assert "frame_id: map" in (tmp_path / "t.yaml").read_text()

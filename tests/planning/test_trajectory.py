@@ -2,15 +2,17 @@
 """Timing keeps the limits and never leaves the path; files come back as they were."""
 
 import json
+import sys
 from itertools import pairwise
 
 import disk_world
 import numpy as np
 import pytest
+import yaml
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from vprism_plan.errors import PlanningError
+from vprism_plan.errors import MissingDependencyError, PlanningError
 from vprism_plan.planning import (
     Trajectory,
     read_trajectory,
@@ -171,3 +173,35 @@ def test_a_file_that_is_no_trajectory_is_named(tmp_path, text):
         read_trajectory(file)
     with pytest.raises(PlanningError, match=r"missing\.json"):
         read_trajectory(tmp_path / "missing.json")
+
+
+def test_files_for_ros_hold_the_same_message(tmp_path):
+    trajectory = time_parameterize(ROBOT, np.array([[0.0, 0.0], [0.7, 0.2], [0.1, 1.0]]))
+    pytest.importorskip("rosbags")
+    for suffix in (".json", ".yaml", ".cdr"):
+        write_trajectory(tmp_path / f"t{suffix}", ROBOT, trajectory, frame_id="base_link")
+    message = json.loads((tmp_path / "t.json").read_text())
+    assert yaml.safe_load((tmp_path / "t.yaml").read_text()) == message
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "trajectory_msgs/msg/JointTrajectory"
+    read = store.deserialize_cdr((tmp_path / "t.cdr").read_bytes(), name)
+    assert read.header.frame_id == "base_link"
+    assert list(read.joint_names) == message["joint_names"]
+    assert len(read.points) == len(message["points"])
+    for point, expected in zip(read.points, message["points"], strict=True):
+        time = expected["time_from_start"]
+        assert (point.time_from_start.sec, point.time_from_start.nanosec) == tuple(time.values())
+        for field in ("positions", "velocities", "accelerations", "effort"):
+            assert getattr(point, field).tolist() == expected[field]
+    # The bytes are what a bag of that message holds.
+    assert bytes(store.serialize_cdr(read, name)) == (tmp_path / "t.cdr").read_bytes()
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    trajectory = time_parameterize(ROBOT, np.zeros((1, 2)))
+    with pytest.raises(MissingDependencyError, match=r"vprism_plan\[export\]"):
+        write_trajectory(tmp_path / "t.cdr", ROBOT, trajectory)
+    assert not list(tmp_path.iterdir())

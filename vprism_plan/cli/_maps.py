@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Commands about the map itself: `map` and `mesh`."""
+"""Commands about the map itself: `map`, `mesh` and `export`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -129,3 +129,31 @@ def run_mesh(command: Command, console: Console) -> int:
     }
     console.finish(payload, lines)
     return 0 if meshes else 1
+
+
+def run_export(command: Command, console: Console) -> int:
+    """Write the world or the trajectory; exit code 0."""
+    if command.input.suffix == ".json":
+        from vprism_plan.planning.trajectory import read_trajectory, write_message
+
+        names, trajectory = read_trajectory(command.input)
+        with console.stage("export"):
+            write_message(command.output, names, trajectory, command.frame_id)
+    else:
+        from vprism_plan.world import World, WorldConfig
+
+        bounds = None if command.bounds is None else np.reshape(command.bounds, (2, 3))
+        config = WorldConfig(
+            command.resolution, occluded=command.occluded, unobserved=command.unobserved,
+            bounds=bounds,
+        )  # fmt: skip
+        m = load(command.input, console)
+        with console.stage("bake"):
+            world = World(m, config)
+        console.warn(world.warnings)
+        with console.stage("export"):
+            world.export(command.output, command.frame_id)
+    size = command.output.stat().st_size
+    payload = {"output": command.output, "bytes": size, "timings": console.timings}
+    console.finish(payload, [console.time_line(), f"wrote {command.output} ({size / 1e6:.2f} MB)"])
+    return 0

@@ -3,12 +3,13 @@
 
 The checker certified straight lines in joint space. Blending corners would leave them, so the
 motion stops where the direction changes, and nowhere else. Between stops all joints share one
-trapezoidal profile along the line. Files hold `trajectory_msgs/JointTrajectory` in JSON.
+trapezoidal profile along the line. Files hold `trajectory_msgs/JointTrajectory` as JSON, YAML or
+in the bytes of ROS 2.
 """
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,8 +20,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import is_whole, number
-from vprism_plan._files import read_json, reading, write_text
-from vprism_plan.errors import PlanningError
+from vprism_plan._files import read_json, reading, replacing, write_text
+from vprism_plan.errors import PlanningError, importing
 from vprism_plan.planning.protocols import Configuration
 
 # Without stated acceleration limits a joint reaches its full speed in this time.
@@ -189,7 +190,9 @@ def _timed(
 def write_trajectory(
     path_file: str | Path, robot: Any, trajectory: Trajectory, frame_id: str = ""
 ) -> None:
-    """Write a trajectory as `trajectory_msgs/JointTrajectory`, whole or not at all.
+    """Write a trajectory as `trajectory_msgs/JointTrajectory`, whole or not at all: as YAML
+    (`.yaml`, `.yml`), as CDR (`.cdr`: bytes that a ROS 2 publisher takes as they are; extra
+    `export`), else as JSON.
 
     Accelerations and efforts stay empty, which the message allows: given accelerations,
     controllers fit quintics, which a trapezoidal profile is not. Joint motions need no
@@ -198,8 +201,16 @@ def write_trajectory(
     Raises:
         PlanningError: joints and columns differ in number, or two points fall on the
             same nanosecond.
+        MissingDependencyError: rosbags is not installed.
     """
-    names = [str(name) for name in robot.joint_names]
+    write_message(path_file, robot.joint_names, trajectory, frame_id)
+
+
+def write_message(
+    path_file: str | Path, joint_names: Iterable[str], trajectory: Trajectory, frame_id: str = ""
+) -> None:
+    """`write_trajectory` for joints of these names."""
+    names = [str(name) for name in joint_names]
     if trajectory.positions.shape[1:] != (len(names),):
         given = f"{trajectory.positions.shape[1:]} joints"
         raise PlanningError(f"the trajectory has {given}, the robot {', '.join(names)}")
@@ -218,7 +229,45 @@ def write_trajectory(
     ]
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
     message = {"header": header, "joint_names": names, "points": points}
-    write_text(path_file, json.dumps(message, indent=1, allow_nan=False) + "\n")
+    suffix = Path(path_file).suffix.lower()
+    if suffix == ".cdr":
+        serialized = _cdr(message)
+        with replacing(path_file) as temporary:
+            temporary.write_bytes(serialized)
+    elif suffix in (".yaml", ".yml"):
+        import yaml  # type: ignore[import-untyped]
+
+        write_text(path_file, yaml.safe_dump(message, default_flow_style=None, sort_keys=False))
+    else:
+        write_text(path_file, json.dumps(message, indent=1, allow_nan=False) + "\n")
+
+
+def _cdr(message: dict[str, Any]) -> bytes:
+    """Serialize a message as ROS 2 sends it, little-endian."""
+    with importing("rosbags", "export"):
+        from rosbags.typesys import Stores, get_typestore
+    store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def make(name: str, **values: Any) -> Any:
+        return store.types[name](**values)
+
+    def of(kind: str, time: dict[str, int]) -> Any:
+        return make(f"builtin_interfaces/msg/{kind}", **time)
+
+    header = message["header"]
+    stamp = of("Time", header["stamp"])
+    points = [
+        make(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            time_from_start=of("Duration", point["time_from_start"]),
+            **{k: np.array(v, np.float64) for k, v in point.items() if k != "time_from_start"},
+        )
+        for point in message["points"]
+    ]
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    stamped = make("std_msgs/msg/Header", stamp=stamp, frame_id=header["frame_id"])
+    whole = make(kind, header=stamped, joint_names=message["joint_names"], points=points)
+    return bytes(store.serialize_cdr(whole, kind))
 
 
 def read_trajectory(path_file: str | Path) -> tuple[tuple[str, ...], Trajectory]:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -438,6 +439,31 @@ class World:
         occupancy = np.asarray(self.map.occupancy(flat)).reshape(nx, ny)
         entropy = np.asarray(self.map.entropy(flat)).reshape(nx, ny)
         return occupancy, entropy, points
+
+    def export(self, path: Any, frame_id: str = "world") -> Path:
+        """Write what is an obstacle in the box of the grid for another stack; return the path.
+
+        Nothing in that box that is an obstacle is free in the file: cells of `config.resolution`
+        are given whole. Beyond the box a file says nothing, and most readers take that for free:
+        `WorldConfig(bounds=...)` has to hold all that the robot can reach. A bound on risk
+        (`CheckerConfig.max_risk`) is not in it.
+
+        Args:
+            path: its suffix says what is written. `.bt`, `.ot`: OctoMap; P(occupied) of the map,
+                0.97 for other obstacles, unknown where nobody looked (extra `export`). `.scene`,
+                `.yaml`: MoveIt's planning scene as text and as message, one collision object of
+                boxes for each of `sources` and `plane_names`. `.npz`: distance field and
+                occupancy, with their convention. `.obj`, `.glb`, `.stl`, `.ply`: surfaces of the
+                cells. `.usd`, `.usda`, `.usdc`: the same as colliders (extra `export`).
+            frame_id: name of the world frame in formats that have one.
+
+        Raises:
+            ConfigError: another suffix; a mesh of a world without obstacles.
+            MissingDependencyError: the library that owns the format is not installed.
+        """
+        from vprism_plan.world.exports import export_world
+
+        return export_world(self, path, frame_id)
 
     @property
     def warnings(self) -> tuple[str, ...]:
