@@ -173,10 +173,8 @@ def _write_octomap(world: "World", path: Path, frame_id: str) -> None:
     value[held] = np.where(judged[held], np.maximum(value[held], _STEPS), sure)
     ids = np.array([name.startswith("object:") for name in cells.names])
     value[held & ~ids[cells.source.reshape(-1)]] = sure
-    steps = np.ceil(value[held | free] / _STEPS).astype(np.int64)
-    steps = steps.clip(*np.round(
-        np.array([tree.getClampingThresMinLog(), tree.getClampingThresMaxLog()]) / _STEPS
-    ).astype(np.int64))  # fmt: skip
+    low, high = tree.getClampingThresMinLog(), tree.getClampingThresMaxLog()
+    steps = np.ceil(value[held | free].clip(low, high) / _STEPS).astype(np.int64)
     points = points[held | free]
     for step in np.unique(steps):
         tree.updateNodes(points[steps == step], float(_STEPS * step), True)
@@ -250,14 +248,10 @@ def _write_mesh(world: "World", path: Path, frame_id: str) -> None:
     if not cells.occupied.any():
         raise ConfigError("nothing is an obstacle in this world, and a mesh of nothing is no file")
     if path.suffix.lower() in (".obj", ".glb"):
-        bodies: Any = {_identifier(name): cells.surface(own) for name, own in cells.bodies()}
+        bodies: Any = {re.sub(r"\W", "_", name): cells.surface(own) for name, own in cells.bodies()}
         trimesh.Scene(bodies).export(path)
     else:  # no names: one surface, without faces between two obstacles
         cells.surface(cells.occupied).export(path)
-
-
-def _identifier(name: str) -> str:
-    return re.sub(r"\W", "_", name)
 
 
 def _write_usd(world: "World", path: Path, frame_id: str) -> None:
@@ -271,13 +265,10 @@ def _write_usd(world: "World", path: Path, frame_id: str) -> None:
     cells = Cells.of(world)
     for name, own in cells.bodies():
         mesh = cells.surface(own)
-        prim = UsdGeom.Mesh.Define(stage, f"/world/{_identifier(name)}")
+        prim = UsdGeom.Mesh.Define(stage, "/world/" + re.sub(r"\W", "_", name))
         prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
-        prim.CreateFaceVertexCountsAttr(
-            Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32))
-        )
-        faces = np.ascontiguousarray(mesh.faces, np.int32).reshape(-1)
-        prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces))
+        prim.CreateFaceVertexCountsAttr([3] * len(mesh.faces))
+        prim.CreateFaceVertexIndicesAttr(mesh.faces.ravel().tolist())
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         UsdPhysics.CollisionAPI.Apply(prim.GetPrim())
         UsdPhysics.MeshCollisionAPI.Apply(prim.GetPrim()).CreateApproximationAttr("none")
