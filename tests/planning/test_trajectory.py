@@ -320,8 +320,8 @@ def test_an_arm_keeps_its_links_apart_in_rounded_corners(repository):
             q = rng.uniform(robot.lower, robot.upper)
             if checker.is_valid(q) and (not path or checker.check_motion(path[-1], q)):
                 path.append(q)
-        motion = time_parameterize(robot, path, checker=checker)
+        motion = time_parameterize(robot, np.array(path), checker=checker)
         q, _ = motion.sample(np.linspace(0.0, motion.duration, 5000))
         assert checker.is_valid_batch(q).all()
-        shorter += motion.duration < 0.95 * time_parameterize(robot, path).duration
+        shorter += motion.duration < 0.95 * time_parameterize(robot, np.array(path)).duration
     assert shorter >= 2
