@@ -292,6 +292,13 @@ class Picky:
         return getattr(self._checker, name) if answer is None else lambda *_: answer
 
 
+def test_who_cannot_judge_a_rounded_corner_is_named(among_balls):
+    checker, _ = among_balls
+    meshes = vp.MeshChecker(checker.world, checker.robot)
+    with pytest.raises(PlanningError, match="checker is a MeshChecker"):
+        time_parameterize(checker.robot, np.zeros((2, 3)), checker=meshes)
+
+
 def test_what_is_refused_is_not_rounded(ball_robot):
     checker = vp.CollisionChecker(vp.World(known=[]), ball_robot(0.05))
     path = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0.0, 0.5, 0.2]])

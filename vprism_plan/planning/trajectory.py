@@ -112,6 +112,9 @@ def time_parameterize(
     if acceleration_limits is not None:
         push = _limits("acceleration", acceleration_limits, names)
 
+    if checker is not None and not hasattr(checker, "check_blend"):
+        needed = "a CollisionChecker judges rounded corners"
+        raise PlanningError(f"checker is a {type(checker).__name__}; {needed}")
     lines = list(_straight_lines(path))
     if checker is not None and len(lines) > 1:
         corners = np.array([path[0], *(line[-1] for line in lines)])
