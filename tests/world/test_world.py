@@ -56,9 +56,10 @@ def test_primitive_distance_equals_the_mesh_distance(solid):
     assert (mesh.bounds[1] <= upper + 1e-9).all()
 
 
+@pytest.mark.parametrize("map_", [random_map(1), None], ids=["map", "no map"])
 @pytest.mark.parametrize("solid", KNOWN, ids=lambda s: s.name)
-def test_known_primitives_are_obstacles(solid):
-    world = World(random_map(1), WorldConfig(known=(solid,), **FREE))
+def test_known_primitives_are_obstacles(solid, map_):
+    world = World(map_, WorldConfig(**FREE), known=[solid])
     field = world.field
     rng = np.random.default_rng(0)
     lower, upper = solid.box()

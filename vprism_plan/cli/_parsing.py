@@ -73,7 +73,7 @@ def parse(arguments: Sequence[str]) -> Command:
         raise UsageError(f"no command given; see {PROGRAM} --help")
     parser = _Parser(PROGRAM, description=_DESCRIPTION)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_demo, _map, _plan, _query, _mesh, _view, _robot, _warmup):
+    for add in (_demo, _map, _plan, _query, _mesh, _export, _view, _robot, _warmup):
         lines = [line.strip() for line in (add.__doc__ or "").splitlines()]
         text = "\n".join(lines).strip()
         command = commands.add_parser(add.__name__[1:], help=lines[0], description=text)
@@ -162,6 +162,25 @@ def _mesh(command: _Parser) -> None:
     take("--output FOLDER", Path, "for object_ID.ply", required=True)
     take("--level P", float, "probability of being occupied at the surface", 0.5)
     take("--resolution M", float, "edge of the grid, m", 0.01)
+
+
+def _export(command: _Parser) -> None:
+    """Write a map's world, or a planned trajectory, for another stack; the suffix says as what.
+
+    A world: .bt .ot (OctoMap), .scene .yaml (MoveIt's planning scene), .npz (distance field and
+    occupancy), .obj .glb .stl .ply (surfaces), .usd .usda .usdc. A trajectory.json of `plan`:
+    .json .yaml (JointTrajectory), .cdr (the bytes of that message in ROS 2). Nothing that is an
+    obstacle is free in the file; outside of its box it says nothing. OctoMap, USD and .cdr need
+    the extra `export`.
+    """
+    take = command.take
+    take("MAP_OR_TRAJECTORY", Path, "a .safetensors map, or trajectory.json", dest="input")
+    take("--output FILE", Path, "file to write", required=True)
+    take("--resolution M", float, "edge of a cell, m", 0.01)
+    text = "lower and upper corner of the box, m; default: around the objects"
+    take("--bounds X Y Z X Y Z", float, text)
+    take("--frame-id NAME", str, "name of the world frame", "world")
+    _policies(command)
 
 
 def _view(command: _Parser) -> None:
@@ -271,6 +290,10 @@ def _rules(command: _Parser) -> None:
     command.take("--max-risk P", float, text, 0.1)
     text = "contacts to allow: a link or group of the robot and an object's id, as hand:3"
     command.take("--allow LINK:ID ...", str, text, ())
+    _policies(command)
+
+
+def _policies(command: _Parser) -> None:
     text = "what space behind visible surfaces counts as"
     command.take("--occluded POLICY", ("occupied", "posterior", "free"), text, "posterior")
     text = "what space outside the image counts as"

@@ -221,7 +221,7 @@ def solve(
             "compiled_kernels": console.compiled,
         }
         if path is not None:
-            timed = time_parameterize(robot, path)
+            timed = time_parameterize(robot, path, checker=checker)
             write_trajectory(aside / "trajectory.json", robot, timed, frame_id="world")
             payload["trajectory"] = {"duration": timed.duration, "points": len(timed.times)}
             dense = dense_path(path, 0.01)

@@ -15,13 +15,14 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior, Weights
+from vprism_plan.mapping.em import Posterior, Weights, diagonal_prior
 from vprism_plan.mapping.factors import correlate, dense, run_per_class
 from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
 from vprism_plan.mapping.prior import MOST, PriorField
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
+_ON_PLANE = 0.02  # m from the support plane, of points that show an empty table
 _SURE = 0.01 - MOST  # log-odds up to which a guess is as sure of nothing as it can be
 MAX_LOG_ODDS = 40.0  # exp(-40) is 4e-18: nothing a float64 probability could still tell from 0
 
@@ -36,7 +37,7 @@ class VPrismMap:
     Attributes:
         config: the parameters it was fitted with.
         object_ids: labels of the objects, sorted.
-        plane: support surface in the world frame.
+        plane: support surface in the world frame; None only of `nothing()`.
         views: every observation that was fitted.
         seed: the seed of the fit.
         warnings: what was odd about the views: sentences with the remedy.
@@ -49,7 +50,7 @@ class VPrismMap:
         self,
         config: MapConfig,
         object_ids: tuple[int, ...],
-        plane: Plane,
+        plane: Plane | None,
         views: tuple[Observation, ...],
         space: FeatureSpace,
         posterior: Posterior,
@@ -59,7 +60,7 @@ class VPrismMap:
     ) -> None:
         self.config = config
         self.object_ids = tuple(object_ids)
-        self.plane = plane
+        self.plane: Any = plane
         self.views = tuple(views)
         self.space = space
         self.posterior = posterior
@@ -108,6 +109,8 @@ class VPrismMap:
     def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Return the corners (m) of a box outside which `support` is exactly 0, and the prior's
         grids call everything empty: nothing of the objects is beyond it."""
+        if len(self.space.hinges) == 0:
+            return np.zeros(3), np.zeros(3)
         lower, upper = self.space.bounds
         if self.prior is None:
             return lower.copy(), upper.copy()
@@ -125,6 +128,16 @@ class VPrismMap:
                 torch.from_numpy(mean)[None], torch.from_numpy(variance)[None]
             )[0]
         )
+
+    def shown(self) -> Float[np.ndarray, "n 3"]:
+        """Return the points (m) that were labelled as objects; of an empty table two corners of a
+        box, around the middle half of what was seen of it."""
+        seen = [view.points() for view in self.views]
+        if self.object_ids or self.plane is None or not seen:
+            return np.concatenate([np.empty((0, 3)), *(p[labels > 0] for p, labels in seen)])
+        points = np.concatenate([p for p, _ in seen])
+        points = points[np.abs(self.plane.signed_distance(points)) < _ON_PLANE]
+        return np.quantile(points, [0.25, 0.75], axis=0) if len(points) else points
 
     # ------------------------------------------------------------------ predictions
     def predict_proba(self, points: Any) -> Any:
@@ -164,7 +177,7 @@ class VPrismMap:
         if isinstance(points, Tensor):
             return prediction.class_entropy(*self._torch_moments(points)[:2]).to(points.dtype)
         log_p = self._log_probabilities(points)
-        return -(np.exp(log_p) * log_p).sum(axis=1)
+        return 0.0 - (np.exp(log_p) * log_p).sum(axis=1)
 
     def support(self, points: Any) -> Any:
         """Return the kernel mass at points (N, 3) m: the sum of all kernel values, no bias: (N,).
@@ -366,6 +379,20 @@ class VPrismMap:
                 for a in (self.space.hinges, self.posterior.mean, covariance)
             )
         return cache[device, dtype]
+
+
+def nothing(
+    config: MapConfig | None = None,
+    plane: Plane | None = None,
+    views: tuple[Observation, ...] = (),
+    seed: int = 0,
+    warnings: tuple[str, ...] = (),
+) -> VPrismMap:
+    """Return a map without objects: every place is empty, and it has no hinge points."""
+    config = MapConfig() if config is None else config
+    space = FeatureSpace(np.zeros((0, 3)), config.gamma, config.cutoff_radius)
+    empty = Posterior(diagonal_prior(space, np.zeros((1, 1)), np.ones(1)), ())
+    return VPrismMap(config, (), plane, views, space, empty, seed, warnings)
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:
