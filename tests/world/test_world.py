@@ -108,6 +108,26 @@ def test_solid_known_mesh_is_filled_and_open_one_is_not():
     assert hollow.field.lower_bound(probe)[0] > 0.0
 
 
+@pytest.mark.parametrize("turned", [0, 3])
+def test_a_known_mesh_of_ten_centimetres_is_as_near_as_it_is_to_two_millimetres(turned):
+    """At the grid's nodes: between them distances lose what those of any obstacle lose."""
+    size, pose = np.array([0.1, 0.07, 0.05]), _turned(turned, (0.1, 0.1, 0.3))
+    exact = Box("exact", size, pose)
+    mesh = trimesh.creation.box(size).apply_transform(pose)
+    world = World(random_map(1), WorldConfig(known=(KnownMesh("box", mesh),), **FREE))
+    field = world.source_field("known:box")
+    truth = exact.signed_distance(world.grid.slab(0, world.grid.shape[0]))
+    nodes = field.distance.reshape(-1)
+    assert (nodes <= np.maximum(truth, 0.0)).all()
+    assert (np.maximum(truth, 0.0) - np.maximum(nodes, 0.0)).max() <= 0.002
+    near = np.random.default_rng(0).normal(pose[:3, 3], 0.05, (5000, 3))
+    truth, bound = exact.signed_distance(near), field.lower_bound(near)
+    close = (truth > 0.0) & (truth < 0.03)
+    assert (bound[close] <= truth[close]).all()
+    assert (bound[truth <= 0.0] <= 0.0).all()
+    assert (truth - np.maximum(bound, 0.0))[close].mean() <= 0.0025
+
+
 def test_half_spaces_are_planes_after_the_support_surface():
     wall = HalfSpace("wall", (0.0, 2.0, 0.0), -1.0)
     map_ = random_map(1, plane=Plane((0.0, 0.0, 1.0), 0.02))

@@ -36,7 +36,7 @@ from vprism_plan.world.levelset import (
     rasterize_level_set,
     trace_level_set,
 )
-from vprism_plan.world.marks import CELLS, Evidence, only, rasterize_mesh, unmark
+from vprism_plan.world.marks import Evidence, only, rasterize_mesh, unmark
 from vprism_plan.world.posterior_worlds import PosteriorWorlds, classes_of
 from vprism_plan.world.seen import RIM, seen_support
 from vprism_plan.world.sources import LAST_MARK, MARKED, SUPPORT, object_id
@@ -269,7 +269,7 @@ class World:
         for item in solids:
             name = f"known:{item.name}"
             if isinstance(item, KnownMesh):
-                distance, _ = distance_to_lattice(rasterize_mesh(item, self.grid, CELLS), self.grid)
+                distance, _ = distance_to_lattice(rasterize_mesh(item, self.grid), self.grid)
                 parts.append(NodeDistances(distance, self._all_of(name, self.grid)))
             else:
                 parts += self._solid_distances(item, name, self.grid)
