@@ -1,12 +1,16 @@
 # Two commands set everything up: `make demo` and `make test`.
 # On a machine where PyPI's torch is a CUDA build and that is not wanted, name an index
 # of CPU wheels:  make demo TORCH_INDEX=<url>
-PYTHON ?= python3.11
+# The first of these that runs here; a name that is only a shim does not.
+PYTHONS := 3.11 3.12 3.13
+ifndef PYTHON
+PYTHON := $(shell for v in $(PYTHONS); do python$$v -c "" 2>/dev/null && echo python$$v && break; done)
+endif
 VENV := .venv
 BIN := $(VENV)/bin
 TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
-EXTRAS ?= dev,experiments,docs,viewer,formats
+EXTRAS ?= dev,experiments,docs,viewer,formats,export,peers
 STAMP := $(VENV)/.installed
 
 .PHONY: demo test test-all lint types docs bench clean
@@ -46,6 +50,7 @@ bench: $(STAMP)
 
 # torch first: resolved later, another package would bring a CUDA build of several GB.
 $(STAMP): pyproject.toml
+	$(if $(PYTHON),,$(error none of Python $(PYTHONS) runs here; install one, or say: make PYTHON=/path/to/python))
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) "$(TORCH)"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What the examples say, beyond that they run and draw: building the site shows that."""
 
+import os
 import re
 import runpy
 import subprocess
@@ -88,3 +89,47 @@ def test_your_own_ompl_program_leaves_without_binding_noise(repository, saved_de
     assert free == edges
     assert "nanobind" not in done.stderr
     assert picture.exists()
+
+
+@pytest.fixture
+def said_with_peer(repository, saved_demo_map):
+    """A function that runs an example with a peer's library and returns what it printed."""
+
+    def run(name, *more):
+        script = repository / "examples" / "peers" / f"{name}.py"
+        command = [sys.executable, script, "--map", saved_demo_map, *more]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run
+
+
+@pytest.mark.slow
+def test_coal_measures_what_we_measure(said_with_peer):
+    pytest.importorskip("coal", reason="coal is not installed (extra `peers`)")
+    found = re.search(
+        r"(\d+) distances: ours are (\S+) to (\S+) mm below", said_with_peer("coal_distances")
+    )
+    assert int(found[1]) > 100
+    assert float(found[2]) >= -0.5  # of the surface's own resolution, 4 mm
+    assert float(found[3]) < 20.0
+
+
+@pytest.mark.slow
+def test_drake_keeps_the_clearance_it_is_given(said_with_peer):
+    pytest.importorskip("pydrake", reason="drake is not installed (extra `peers`)")
+    said = said_with_peer("drake_constraint")
+    assert float(re.search(r"wanted: (\S+) mm", said)[1]) < 0.0
+    assert "kSolutionFound" in said
+    assert float(re.search(r"found: (\S+) mm, valid: True", said)[1]) > 19.0
+
+
+@pytest.mark.slow
+def test_mplib_plans_on_our_boxes(said_with_peer):
+    peer = os.environ.get("MPLIB_PYTHON")
+    if peer is None:
+        pytest.skip("MPLIB_PYTHON names no interpreter with mplib, which needs numpy below 2")
+    said = said_with_peer("mplib_plans", "--peer", peer)
+    free, edges = re.search(r"(\d+) of (\d+) edges free", said).groups()
+    assert free == edges

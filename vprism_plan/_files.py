@@ -42,6 +42,21 @@ def replacing(path: str | Path) -> Iterator[Path]:
         raise
 
 
+def cache_folder(name: str) -> Path | None:
+    """A folder for what can be made again: of the user's cache, else of the temporary files as for
+    compiled code (`_kernels.jit`); None where none can be written to."""
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+        folder = home.absolute() / "vprism_plan" / name
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except (OSError, RuntimeError):  # not writable, or no home
+        from vprism_plan._kernels.jit import own_temporary_folder
+
+        return own_temporary_folder()
+
+
 def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text to `path`, whole or not at all."""
     with replacing(path) as temporary:

@@ -25,5 +25,6 @@ PRESETS: dict[str, Callable[[], MapConfig]] = {
 
 def fit(observation: Observation, seed: int, preset: str) -> VPrismMap:
     """Fit with one of the presets; "vprism-flat" is the default without its shape prior."""
+    observation.require_objects()
     prior = None if preset == "vprism-flat" else "shape"
     return fit_map(observation, PRESETS[preset](), seed, prior)

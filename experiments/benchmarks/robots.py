@@ -31,7 +31,7 @@ def measured(name: str, files) -> tuple[dict, Robot]:
     clock = time.process_time()
     robot = Robot.from_urdf(files.urdf, **options, spheres="fit")
     fitted = time.process_time() - clock
-    bare = {link: [] for link in (*robot.geometry, *robot.links_with_meshes)}
+    bare = {link: [] for link in (*robot.geometry, *robot.meshes_as_read)}
     rows = {
         k: [{"center": r[:3], "radius": r[3]} for r in v] for k, v in robot.link_spheres.items()
     }

@@ -99,7 +99,7 @@ def propose(
         how: where, and how far tilted.
     """
     rng, robot, field = np.random.default_rng([seed, 0xA5CED]), checker.robot, checker.world.field
-    arrays, tip = robot.arrays, find_tip(robot, _HAND, np.random.default_rng(0))
+    arrays, tip = robot.arrays, find_tip(robot, _HAND)
     # Hand and fingers are fixed to one frame: a pose of it says whether they are clear.
     own = np.flatnonzero(arrays.sphere_frame == tip.frame)
     offsets = arrays.sphere_center[own]

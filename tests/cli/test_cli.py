@@ -50,7 +50,6 @@ BROKEN = {
     "wrong shape": ("a.npz", {"depth": lambda d: d[0]}, "depth"),
     "labels of another shape": ("b.npz", {"labels": lambda x: x[:-1]}, "labels"),
     "negative depth": ("c.npz", {"depth": lambda d: np.where(d > 1.0, -0.5, d)}, "negative"),
-    "labels without objects": ("d.npz", {"labels": lambda x: 0 * x}, "object"),
     "singular intrinsics": ("e.npz", {"intrinsics": lambda k: 0 * k}, "intrinsics"),
     "pose that is not rigid": ("f.npz", {"T_world_camera": lambda t: 2 * t}, "T_world_camera|pose"),
     "no plane": ("g.npz", {"depth": lambda d: np.where(d > 0, 0 * d, d)}, "plane|depth|return"),
@@ -80,6 +79,27 @@ def test_broken_input_is_one_clear_line_and_leaves_nothing_behind(name, view, tm
 
     assert re.search(words, err[0]), err[0]
     assert not list(tmp_path.glob("out/*"))
+
+
+def test_an_empty_table_is_mapped_and_planned_over(view, tmp_path, repository, capsys):
+    empty = write(
+        tmp_path / "empty.npz", depth=view.depth, labels=0 * view.labels,
+        intrinsics=view.intrinsics, T_world_camera=view.T_world_camera,
+    )  # fmt: skip
+    code, out, _ = call(capsys, "map", empty, "--output", tmp_path / "map.safetensors")
+    assert code == 0
+    assert "0 objects" in out
+    assert "warning: no pixel has an object's label" in out
+    robot = ("--robot", repository / "urdf" / "panda.urdf")
+    code, out, _ = call(
+        capsys, "plan", tmp_path / "map.safetensors", *robot, "--output", tmp_path / "plan"
+    )
+    assert code == 0, out
+    assert (tmp_path / "plan" / "map.png").exists()
+    code, *_ = call(capsys, "view", tmp_path / "map.safetensors")
+    assert code == 2
+    code, *_ = call(capsys, "map", empty, "--output", tmp_path / "map.safetensors", "--strict")
+    assert code == 2
 
 
 def test_scattered_points_without_labels_have_no_plane(view, tmp_path, capsys):
@@ -153,6 +173,46 @@ def test_a_bad_question_is_bad_input(arguments, words, saved_map, repository, ca
     assert code == 2
     assert len(err) == 1
     assert re.search(words, err[0])
+
+
+def test_query_and_plan_take_what_belongs_to_a_urdf(saved_map, repository, tmp_path, capsys):
+    """Meshes in a folder of packages, spheres and an SRDF elsewhere, a group of its joints."""
+    import trimesh
+
+    urdf = planar(repository).read_text().replace('<robot name="planar3"', '<robot name="mine"')
+    mesh = (
+        '<collision><geometry><mesh filename="package://mine/m.stl"/></geometry></collision></link>'
+    )
+    own = tmp_path / "there" / "mine.urdf"
+    own.parent.mkdir()
+    own.write_text(urdf.replace("</link>", mesh, 1))
+    (tmp_path / "packages" / "mine").mkdir(parents=True)
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(tmp_path / "packages" / "mine" / "m.stl")
+    srdf = tmp_path / "other.srdf"
+    srdf.write_text(
+        planar(repository)
+        .with_suffix(".srdf")
+        .read_text()
+        .replace(
+            "</robot>",
+            '<group name="two"><joint name="joint3"/><joint name="joint1"/></group></robot>',
+        )
+    )
+    spheres = repository / "urdf" / "planar3_spheres.yml"
+    options = ["--robot", own, "--srdf", srdf, "--spheres", spheres, "--group", "two"]
+    options += ["--package-dirs", tmp_path / "packages", "--base-xyz", "3", "0", "-0.1", "--json"]
+    code, out, _ = call(capsys, "query", saved_map, *options, "--q", "0.1", "0.2")
+    said = json.loads(out)
+    assert code == 0
+    assert said["joint_names"] == ["joint3", "joint1"]
+    assert not any("mesh" in text for text in said["warnings"])
+    ends = ["--start", "0", "0.2", "--goal", "0", "0.5", "--output", tmp_path / "out"]
+    code, out, _ = call(capsys, "plan", saved_map, *options, *ends)
+    assert code == 0
+    assert json.loads(out)["joint_names"] == ["joint3", "joint1"]
+    code, _, err = call(capsys, "query", saved_map, *options, "--group", "none", "--q", "0")
+    assert code == 2
+    assert "'none'" in err[0]
 
 
 def test_an_unknown_robot_file_is_bad_input(saved_map, tmp_path, capsys):
@@ -259,3 +319,30 @@ def test_warmup_compiles_each_half_that_is_not_cached_in_a_process_of_its_own(ca
     monkeypatch.setattr("vprism_plan._kernels.jit.is_cached", lambda kernel: True)
     assert call(capsys, "warmup")[0] == 0
     assert len(started) == 4
+
+
+@pytest.mark.parametrize("suffix", [".bt", ".scene", ".npz", ".glb"])
+def test_a_map_is_exported_by_its_suffix(suffix, saved_map, tmp_path, capsys):
+    if suffix == ".bt":
+        pytest.importorskip("pyoctomap")
+    file = tmp_path / "out" / f"world{suffix}"
+    box = ("--bounds", -0.1, -0.1, -0.02, 0.1, 0.1, 0.2)
+    code, out, err = call(capsys, "export", saved_map, "--output", file, *box, "--json")
+    assert (code, err) == (0, [])
+    assert json.loads(out)["bytes"] == file.stat().st_size > 100
+    code, _, err = call(capsys, "export", saved_map, "--output", tmp_path / "world.dae", *box)
+    assert code == 2
+    assert ".scene" in err[0]
+
+
+def test_a_trajectory_is_exported_for_ros(tmp_path, capsys):
+    from vprism_plan.planning.trajectory import Trajectory, write_message
+
+    motion = Trajectory(np.array([0.0, 1.5]), np.array([[0.0], [1.0]]), np.zeros((2, 1)))
+    write_message(tmp_path / "trajectory.json", ["slide"], motion)
+    code, *_ = call(
+        capsys, "export", tmp_path / "trajectory.json", "--output", tmp_path / "t.yaml",
+        "--frame-id", "map",
+    )  # fmt: skip
+    assert code == 0
+    assert "frame_id: map" in (tmp_path / "t.yaml").read_text()

@@ -592,3 +592,41 @@ def test_attached_objects_are_solids_like_any_other(world, flyer):
         assert tuple(c for c in contacts if "cup" not in {c.link, c.body}) == plain.contacts(q)
         touched |= {c.kind for c in contacts if c.link == "cup"}
     assert {"object", "known", "support"} <= touched
+
+
+TWO = (("1", "a", "x"), ("2", "x", "m"), ("3", "m", "b"))
+
+
+def test_a_self_collision_buffer_counts_for_meshes_too(world, tmp_path):
+    """Two balls that slide apart: with buffers of 1 and 2 cm they are refused 3 cm sooner."""
+    shape = '<collision><geometry><sphere radius="0.03"/></geometry></collision>'
+    away = (
+        '<collision><origin xyz="0 0 5"/><geometry><sphere radius="0.01"/></geometry></collision>'
+    )
+    links = {"a": shape, "x": "", "m": away, "b": shape}
+    joints = (
+        JOINT.format(n=n, p=p, c=c, kind="prismatic", a="1 0 0", l=1, o="") for n, p, c in TWO
+    )
+    path = tmp_path / "two.urdf"
+    path.write_text(
+        '<robot name="two">'
+        + "".join(f'<link name="{name}">{own}</link>' for name, own in links.items())
+        + "".join(joints)
+        + "</robot>"
+    )
+    row = {"center": [0, 0, 0], "radius": 0.03}
+    spheres = {"a": [row], "b": [row], "m": [{"center": [0, 0, 5], "radius": 0.01}]}
+    kept = {"collision_spheres": spheres, "self_padding": {"a": 0.01, "b": 0.02}}
+    base = np.eye(4)
+    base[:3, 3] = 0.0, 0.0, 2.0
+    srdf = tmp_path / "none.srdf"
+    srdf.write_text('<robot name="two"/>')
+    for content, needed in ((spheres, 0.06), (kept, 0.09)):
+        robot = vp.Robot.from_urdf(path, srdf, content, base)
+        for judge in (make(world, robot), vp.CollisionChecker(world, robot)):
+            for way in (needed - 1e-4, needed + 1e-4):
+                q = np.array([way, 0.0, 0.0])
+                assert judge.is_valid(q) == (way > needed)
+                gap = float(judge.self_clearance_batch(q[None])[0])
+                assert gap == pytest.approx(way - needed, abs=1e-9)
+                assert bool(judge.contacts(q)) == (way < needed)

@@ -5,9 +5,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from vprism_plan.errors import MapError, ObservationError, PlaneNotFoundError
-from vprism_plan.mapping import MapConfig, fit_map
+from vprism_plan.mapping import MapConfig, fit_map, load_map
 from vprism_plan.mapping.em import expand_prior, weight_prior
 from vprism_plan.mapping.features import FeatureSpace
 from vprism_plan.mapping.fitting import training_data
@@ -200,10 +201,35 @@ def test_no_labels_point_to_segmentation():
         fit_map(Observation(obs.depth, None, obs.intrinsics, obs.pose))
 
 
-def test_no_objects_point_to_segmentation():
+def test_an_empty_table_is_a_map_that_says_so(scene, tmp_path):
     obs, nothing = table_only()
-    with pytest.raises(ObservationError, match="segment_tabletop"):
-        fit_map(Observation(obs.depth, nothing, obs.intrinsics, obs.pose))
+    empty = Observation(obs.depth, nothing, obs.intrinsics, obs.pose)
+    fitted = fit_map(empty)
+    assert fitted.object_ids == ()
+    assert any("segment_tabletop" in text for text in fitted.warnings)
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    assert (fitted.predict_proba(points) == 1.0).all()
+    assert (fitted.entropy(points) == 0.0).all()
+    assert (fitted.occupancy(torch.from_numpy(points)) == 0.0).all()
+    fitted.save(tmp_path / "map.safetensors")
+    again = load_map(tmp_path / "map.safetensors")
+    assert (again.object_ids, again.warnings) == (fitted.object_ids, fitted.warnings)
+    assert again.plane.offset == fitted.plane.offset
+    # What is seen later enters, and a later view in which nothing is left takes nothing away.
+    later = fitted.update(scene.observation)
+    assert later.object_ids == scene.observation.object_ids
+    assert later.update(empty).object_ids == later.object_ids
+
+
+def test_labels_of_which_none_is_an_object_are_refused():
+    obs, labels = table_only()
+    hidden = np.where(obs.depth == 0, 0, labels)
+    row, column = np.argwhere(obs.depth > 0)[0]
+    hidden[row, column] = 3
+    depth = obs.depth.copy()
+    depth[row, column] = 0.0
+    with pytest.raises(ObservationError, match="no depth return"):
+        fit_map(Observation(depth, hidden, obs.intrinsics, obs.pose))
 
 
 def test_no_plane_is_an_error():

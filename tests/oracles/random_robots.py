@@ -65,6 +65,7 @@ def random_arrays(rng: np.random.Generator, dof: int = 4, reach: float = 0.6) ->
         link_radius=link_radius,
         link_fixed=np.array([f == 0 for f, _ in links]),
         link_padding=np.zeros(len(links)),
+        link_buffer=np.zeros(len(links)),
         pairs=np.array(pairs, dtype=np.int64).reshape(-1, 2),
         lower=-limit,
         upper=limit,

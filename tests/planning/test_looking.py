@@ -146,6 +146,13 @@ def test_what_cannot_be_weighed_is_refused(checker, world, ball_robot):
         vp.next_view(checker, START, START, [])
     with pytest.raises(PlanningError, match="view 1"):
         vp.next_view(checker, START, START, [np.eye(4), 2.0 * np.eye(4)])
+    empty = vp.CollisionChecker(vp.World(known=[]), ball_robot(RADIUS))
+    with pytest.raises(PlanningError, match="give intrinsics and shape"):
+        vp.next_view(empty, START, START, VIEWS)
+    nothing = vp.next_view(
+        empty, START, [0.1, 0.0, 0.2], VIEWS, intrinsics=np.eye(3), shape=(480, 640)
+    )
+    assert (nothing.risk, nothing.utility, nothing.best) == (0.0, 1.0, None)
     certain = vp.CollisionChecker(world, ball_robot(RADIUS), vp.CheckerConfig(max_risk=None))
     with pytest.raises(ConfigError, match="max_risk"):
         vp.next_view(certain, START, START, VIEWS)

@@ -2,21 +2,27 @@
 """Timing keeps the limits and never leaves the path; files come back as they were."""
 
 import json
+import sys
 from itertools import pairwise
+from types import SimpleNamespace
 
 import disk_world
 import numpy as np
 import pytest
+import yaml
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from oracles.small_scenes import at
 
-from vprism_plan.errors import PlanningError
+import vprism_plan as vp
+from vprism_plan.errors import MissingDependencyError, PlanningError
 from vprism_plan.planning import (
     Trajectory,
     read_trajectory,
     time_parameterize,
     write_trajectory,
 )
+from vprism_plan.world import Box, HalfSpace, Sphere
 
 ROBOT = disk_world.robot(2)
 
@@ -171,3 +177,158 @@ def test_a_file_that_is_no_trajectory_is_named(tmp_path, text):
         read_trajectory(file)
     with pytest.raises(PlanningError, match=r"missing\.json"):
         read_trajectory(tmp_path / "missing.json")
+
+
+def test_files_for_ros_hold_the_same_message(tmp_path):
+    trajectory = time_parameterize(ROBOT, np.array([[0.0, 0.0], [0.7, 0.2], [0.1, 1.0]]))
+    pytest.importorskip("rosbags")
+    for suffix in (".json", ".yaml", ".cdr"):
+        write_trajectory(tmp_path / f"t{suffix}", ROBOT, trajectory, frame_id="base_link")
+    message = json.loads((tmp_path / "t.json").read_text())
+    assert yaml.safe_load((tmp_path / "t.yaml").read_text()) == message
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "trajectory_msgs/msg/JointTrajectory"
+    read = store.deserialize_cdr((tmp_path / "t.cdr").read_bytes(), name)
+    assert read.header.frame_id == "base_link"
+    assert list(read.joint_names) == message["joint_names"]
+    assert len(read.points) == len(message["points"])
+    for point, expected in zip(read.points, message["points"], strict=True):
+        time = expected["time_from_start"]
+        assert (point.time_from_start.sec, point.time_from_start.nanosec) == tuple(time.values())
+        for field in ("positions", "velocities", "accelerations", "effort"):
+            assert getattr(point, field).tolist() == expected[field]
+    # The bytes are what a bag of that message holds.
+    assert bytes(store.serialize_cdr(read, name)) == (tmp_path / "t.cdr").read_bytes()
+
+
+def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    trajectory = time_parameterize(ROBOT, np.zeros((1, 2)))
+    with pytest.raises(MissingDependencyError, match=r"vprism_plan\[export\]"):
+        write_trajectory(tmp_path / "t.cdr", ROBOT, trajectory)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def among_balls(ball_robot):
+    """A checker of a ball of 5 cm among balls and a floor, and the distance to these."""
+    rng = np.random.default_rng(0)
+    balls = [Sphere(f"b{i}", rng.uniform(0.05, 0.15), rng.uniform(-0.6, 0.6, 3)) for i in range(12)]
+    robot = ball_robot(0.05)
+    world = vp.World(known=[*balls, HalfSpace("floor", (0.0, 0.0, 1.0), -0.7)])
+
+    def gap(points):
+        solids = [ball.signed_distance(points) for ball in balls]
+        return np.minimum(np.min(solids, axis=0), points[:, 2] + 0.7) - 0.05
+
+    return vp.CollisionChecker(world, robot), gap
+
+
+def free_path(checker, rng, corners):
+    """Random corners joined by free edges."""
+    path = []
+    while len(path) < corners:
+        q = rng.uniform(-0.7, 0.7, 3)
+        if checker.is_valid(q) and (not path or checker.check_motion(path[-1], q)):
+            path.append(q)
+    return np.array(path)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_rounded_corners_touch_nothing_and_keep_the_limits(among_balls, seed):
+    checker, gap = among_balls
+    rng = np.random.default_rng(seed)
+    path = free_path(checker, rng, 7)
+    limits = {"velocity_limits": [1.0, 2.0, 0.5], "acceleration_limits": rng.uniform(0.5, 8.0, 3)}
+    stops = time_parameterize(checker.robot, path, **limits)
+    motion = time_parameterize(checker.robot, path, **limits, checker=checker)
+    assert motion.duration <= stops.duration * (1 + 1e-9)
+    fine = np.linspace(0.0, motion.duration, 20_001)
+    q, v = motion.sample(fine)
+    assert gap(q).min() > 0.0
+    assert np.all(np.abs(v) <= np.array(limits["velocity_limits"]) * (1 + 1e-9))
+    rate = np.abs(np.diff(v, axis=0)) / np.diff(fine)[:, None]
+    assert np.all(rate <= limits["acceleration_limits"] * (1 + 1e-5) + 1e-9)
+    walked = q[0] + np.cumsum((v[1:] + v[:-1]) / 2 * np.diff(fine)[:, None], axis=0)
+    assert np.abs(walked - q[1:]).max() < 1e-5
+    assert np.array_equal(q[0], path[0])
+    np.testing.assert_allclose(q[-1], path[-1], atol=1e-12)
+    assert np.all(motion.velocities[[0, -1]] == 0.0)
+
+
+def test_with_room_corners_cost_little_and_without_room_they_are_stops(ball_robot):
+    robot = ball_robot(0.05)
+    path = np.array([[0.0, 0, 0], [0.5, 0, 0], [1.0, 0.1, 0], [1.5, 0, 0.1], [2.0, 0, 0]])
+    open_space = vp.CollisionChecker(vp.World(known=[]), robot)
+    stops = time_parameterize(robot, path)
+    rounded = time_parameterize(robot, path, checker=open_space)
+    straight = time_parameterize(robot, path[[0, -1]])
+    assert rounded.duration < 1.2 * straight.duration < 0.9 * stops.duration
+    # A box 2 cm beside the ball, on the inner side of a corner.
+    corner = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0]])
+    inside = Box("inside", (0.35, 0.35, 0.2), at(0.255, 0.245, 0.0))
+    room = vp.WorldConfig(0.004, bounds=((0.0, 0.0, -0.1), (0.5, 0.5, 0.1)))
+    touching = vp.CollisionChecker(vp.World(config=room, known=[inside]), robot)
+    assert touching.check_motion(corner[0], corner[1])
+    assert touching.check_motion(corner[1], corner[2])
+    assert not touching.check_blend([0.25, 0.0, 0.0], corner[1], [0.5, 0.25, 0.0])
+    motion = time_parameterize(robot, corner, checker=touching)
+    free = time_parameterize(robot, corner, checker=open_space)
+    assert free.duration < motion.duration <= time_parameterize(robot, corner).duration
+    q, _ = motion.sample(np.linspace(0.0, motion.duration, 5000))
+    assert (inside.signed_distance(q) > 0.05).all()
+
+
+class Picky:
+    """Refuses every rounded corner, or the risk of every motion."""
+
+    def __init__(self, checker, **answers):
+        self._checker, self._answers = checker, answers
+
+    def __getattr__(self, name):
+        answer = self._answers.get(name)
+        return getattr(self._checker, name) if answer is None else lambda *_: answer
+
+
+def test_who_cannot_judge_a_rounded_corner_is_named(among_balls):
+    checker, _ = among_balls
+    meshes = vp.MeshChecker(checker.world, checker.robot)
+    with pytest.raises(PlanningError, match="checker is a MeshChecker"):
+        time_parameterize(checker.robot, np.zeros((2, 3)), checker=meshes)
+
+
+def test_what_is_refused_is_not_rounded(ball_robot):
+    checker = vp.CollisionChecker(vp.World(known=[]), ball_robot(0.05))
+    path = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0], [0.0, 0.5, 0.2]])
+    stops = time_parameterize(checker.robot, path)
+    never = time_parameterize(checker.robot, path, checker=Picky(checker, check_blend=False))
+    np.testing.assert_allclose(never.duration, stops.duration)
+    assert {tuple(q) for q in path} <= {tuple(q) for q in never.positions}
+    risk = SimpleNamespace(upper=0.2)
+    risky = time_parameterize(
+        checker.robot, path, checker=Picky(checker, collision_probability=risk)
+    )
+    assert np.array_equal(risky.positions, stops.positions)
+
+
+def test_an_arm_keeps_its_links_apart_in_rounded_corners(repository):
+    robot = vp.Robot.from_urdf(repository / "urdf" / "panda.urdf")
+    floor = HalfSpace("floor", (0.0, 0.0, 1.0), -0.05)
+    pole = Box("pole", (0.1, 0.1, 1.0), at(0.45, 0.2, 0.45))
+    checker = vp.CollisionChecker(
+        vp.World(known=[floor, pole]), robot, vp.CheckerConfig(self_margin=0.005)
+    )
+    rng, shorter = np.random.default_rng(3), 0
+    for _ in range(4):
+        path: list[np.ndarray] = []
+        while len(path) < 5:
+            q = rng.uniform(robot.lower, robot.upper)
+            if checker.is_valid(q) and (not path or checker.check_motion(path[-1], q)):
+                path.append(q)
+        motion = time_parameterize(robot, np.array(path), checker=checker)
+        q, _ = motion.sample(np.linspace(0.0, motion.duration, 5000))
+        assert checker.is_valid_batch(q).all()
+        shorter += motion.duration < 0.95 * time_parameterize(robot, np.array(path)).duration
+    assert shorter >= 2

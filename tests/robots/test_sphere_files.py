@@ -6,10 +6,15 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from small_urdfs import TWO
+from oracles.checker_oracle import BallWorld
+from small_urdfs import TWO, chain, joint
 
+from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import RobotError
+from vprism_plan.planning import time_parameterize
+from vprism_plan.planning._inverse_kinematics import find_tip
 from vprism_plan.robots import Robot, read_spheres, write_spheres
+from vprism_plan.robots.pairs import pair_gaps
 
 ONE = {"center": [0.1, 0.0, -0.2], "radius": 0.07}
 OFF = {"center": [0, 0, 0], "radius": -10.0}
@@ -132,3 +137,117 @@ def test_a_robot_read_from_what_it_wrote_is_the_same(robots, urdf_folder, tmp_pa
     np.testing.assert_array_equal(again.sphere_radii, robot.sphere_radii)
     np.testing.assert_array_equal(again.named_states["ready"], robot.named_states["ready"])
     assert again.groups["hand"] == robot.groups["hand"]
+
+
+# ------------------------------------------------------- what such files say beside spheres
+WHOLE = {
+    "curobo": CUROBO
+    | {
+        "self_collision_buffer": {"a": 0.01, "c": 0.02, "b": -0.01},
+        "self_collision_ignore": {"a": ["c", "zz"]},
+        "cspace": {
+            "joint_names": ["j2", "finger", "j1"],
+            "retract_config": [0.5, 0.01, 0.25],
+            "max_acceleration": [3.0, 1.0, 4.0],
+        },
+        "lock_joints": {"finger": 0.02},
+        "ee_link": "b",
+    },
+    "xrdf": XRDF
+    | {
+        "self_collision": {
+            "geometry": "mine",
+            "buffer_distance": {"a": 0.01, "c": 0.02},
+            "ignore": {"a": ["c", "zz"]},
+        },
+        "cspace": {"joint_names": ["j2", "j1"], "acceleration_limits": [3.0, 4.0]},
+        "default_joint_positions": {"j1": 0.25, "finger": 0.02, "j2": 0.5},
+        "tool_frames": ["b"],
+    },
+}
+FINGER = joint(
+    "finger", "c", "d", kind="prismatic", limit='<limit lower="0" upper="0.04" velocity="1"/>'
+)
+FOUR = chain(
+    joint("j1", "a", "b"), joint("j2", "b", "c", xyz="0.3 0 0"), FINGER, links=("a", "b", "c", "d")
+)
+
+
+def whole(tmp_path, kind):
+    """The robot file, which leaves link d to be fitted."""
+    content = WHOLE[kind]
+    return saved(tmp_path, {"kinematics": content} if kind == "curobo" else content, f"r.{kind}")
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_a_whole_robot_file_is_the_robot(tmp_path, write, kind):
+    robot = Robot.from_urdf(write(FOUR), spheres=whole(tmp_path, kind))
+    assert robot.joint_names == ("j2", "j1")
+    assert robot.locked == {"finger": 0.02}
+    np.testing.assert_array_equal(robot.neutral, [0.5, 0.25])
+    np.testing.assert_array_equal(robot.acceleration_limits, [3.0, 4.0])
+    assert robot.tool == "b"
+    assert find_tip(robot, None).chain == (1,)
+    assert robot.disabled_pairs[frozenset("ac")] == "Ignored"
+    np.testing.assert_array_equal(robot.arrays.link_buffer, [0.01, 0.0, 0.02, 0.0])
+    (odd,) = [text for text in robot.warnings if "lacks" in text]
+    assert "('zz',)" in odd
+    # What is asked for outranks the file.
+    other = Robot.from_urdf(
+        write(FOUR), spheres=whole(tmp_path, kind), joints=["j1"], locked={"finger": 0.0}
+    )
+    assert other.locked == {"j2": 0.5, "finger": 0.0}
+    timed = time_parameterize(robot, np.array([[0.0, 0.0], [0.5, 0.0]]), velocity_limits=[1.0, 1.0])
+    assert timed.duration == pytest.approx(0.5 / 1.0 + 1.0 / 3.0)
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_a_self_collision_buffer_is_kept_between_links(tmp_path, write, kind):
+    """Links come less near to each other, to the world as near as before."""
+    buffer = {"a": 0.01, "c": 0.02}
+    if kind == "curobo":
+        plain = WHOLE[kind] | {"self_collision_ignore": {}, "self_collision_buffer": None}
+        content = plain | {"self_collision_buffer": buffer}
+    else:
+        plain = WHOLE[kind] | {"self_collision": {"ignore": {}}}
+        content = plain | {"self_collision": {"ignore": {}, "buffer_distance": buffer}}
+    files = [{"kinematics": c} if kind == "curobo" else c for c in (content, plain)]
+    tables = [read_spheres(file) for file in files]
+    assert [table.buffer for table in tables] == [buffer, {}]
+    kept, bare = (Robot.from_urdf(write(FOUR), spheres=file) for file in files)
+    pair = sorted(kept.link_names.index(name) for name in "ac")
+    at = kept.collision_pairs.tolist().index(pair)
+    q = np.random.default_rng(0).uniform(kept.lower, kept.upper, (50, kept.dof))
+    gaps = [pair_gaps(r.arrays, q, r.collision_pairs)[:, at] for r in (kept, bare)]
+    np.testing.assert_allclose(gaps[0], gaps[1] - 0.03, atol=1e-12)
+    world = BallWorld(np.array([[0.4, 0.1, 0.3]]), np.array([0.05]), np.empty((0, 4))).baked()
+    for row in q[:10]:
+        one, two = (CollisionChecker(world, robot) for robot in (kept, bare))
+        assert one.clearance(row) == two.clearance(row)
+        apart = [float(c.self_clearance_batch(row[None])[0]) for c in (one, two)]
+        assert apart[0] <= apart[1]
+
+
+def test_self_padding_is_written_and_read_back(tmp_path, write):
+    robot = Robot.from_urdf(write(FOUR), spheres=whole(tmp_path, "curobo"))
+    robot.write_spheres(tmp_path / "own.yml")
+    again = Robot.from_urdf(write(FOUR), spheres=tmp_path / "own.yml")
+    np.testing.assert_array_equal(again.arrays.link_buffer, robot.arrays.link_buffer)
+    np.testing.assert_array_equal(again.arrays.link_padding, robot.arrays.link_padding)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"cspace": {"joint_names": ["j1"], "retract_config": [0.1, 0.2]}}, "shorter|longer"),
+        ({"cspace": ["j1"]}, "a usable file of spheres"),
+        ({"lock_joints": {"finger": "open"}}, "'open'"),
+        ({"lock_joints": {"finger": float("nan")}}, "finite"),
+        ({"self_collision_ignore": ["a"]}, "a usable file of spheres"),
+        ({"cspace": {"joint_names": ["j1"], "max_acceleration": "fast"}}, "'fast'"),
+    ],
+)
+def test_a_broken_robot_file_is_one_clear_line(write, change, words):
+    with pytest.raises(RobotError, match=words) as caught:
+        read_spheres({"kinematics": CUROBO | change})
+    assert "\n" not in str(caught.value)

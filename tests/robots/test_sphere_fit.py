@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from oracles.kinematics_oracle import random_pose
 
 from vprism_plan.errors import RobotError
-from vprism_plan.robots import fit_spheres
+from vprism_plan.robots import fit_spheres, sphere_fit
 from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.report import enclosed, protrusion, sphere_gap
 from vprism_plan.robots.sphere_fit import SphereFit
@@ -140,3 +140,58 @@ def test_a_number_of_spheres_can_be_set_for_one_link():
     fit = SphereFit(max_spheres={"a": 3})
     assert fit.most("a", triangles) == 3
     assert fit.most("b", triangles) == SphereFit().most("b", triangles) == 12
+
+
+# ------------------------------------------------------------------- kept from run to run
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """Where fitted spheres are kept, and how often some are fitted."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    fitted = []
+    real = sphere_fit._fitted
+    monkeypatch.setattr(sphere_fit, "_fitted", lambda *a: (fitted.append(1), real(*a))[1])
+
+    def fit(tolerance=0.01, most=4, size=0.1):
+        """As in a new process."""
+        sphere_fit._fit.cache_clear()
+        triangles = np.array(trimesh.creation.box((size, size, size)).triangles)
+        return fit_spheres(triangles, tolerance, most)
+
+    yield tmp_path / "vprism_plan" / "spheres", fit, fitted
+    sphere_fit._fit.cache_clear()
+
+
+def test_fitted_spheres_are_kept_from_run_to_run(kept):
+    folder, fit, fitted = kept
+    first = fit()
+    np.testing.assert_array_equal(fit(), first)
+    assert len(fitted) == 1
+    assert fit().flags.writeable
+    for changed in ({"tolerance": 0.02}, {"most": 3}, {"size": 0.2}):
+        fit(**changed)
+    assert len(fitted) == 4
+    assert len(list(folder.iterdir())) == 4
+
+
+DAMAGES = (lambda b: b[:-9], lambda b: b[:40] + b"x" + b[41:], lambda _: b"")
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=["cut", "changed", "empty"])
+def test_a_damaged_file_is_made_anew(kept, damage):
+    folder, fit, fitted = kept
+    first = fit()
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(damage(whole))
+    np.testing.assert_array_equal(fit(), first)
+    assert len(fitted) == 2
+    assert file.read_bytes() == whole
+
+
+def test_without_a_folder_to_write_to_spheres_are_fitted(kept, tmp_path, monkeypatch):
+    _, fit, _ = kept
+    first = fit()
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setattr("vprism_plan._kernels.jit.own_temporary_folder", lambda: None)
+    np.testing.assert_array_equal(fit(), first)

@@ -41,8 +41,24 @@ MALFORMED = {
         r"joints \['j1', 'j2'\] .* form a cycle",
     ),
     "unknown type": (chain(joint("j1", "a", "b", kind="ball")), "type 'ball'; valid:"),
-    "floating": (chain(joint("j1", "a", "b", kind="floating")), "joint 'j1' is floating"),
-    "planar": (chain(joint("j1", "a", "b", kind="planar")), "joint 'j1' is planar"),
+    "floating below what moves": (
+        chain(joint("j1", "a", "b"), joint("j2", "b", "c", kind="floating")),
+        r"joints \['j2'\] .* floating or planar; .* make them fixed",
+    ),
+    "planar below what moves": (
+        chain(joint("j1", "a", "b"), joint("j2", "b", "c", kind="planar")),
+        r"joints \['j2'\] .* floating or planar",
+    ),
+    "words for a radius": (TWO.replace('"0.05"', '"wide"', 1), "link 'a' .* 'wide'"),
+    "no radius": (TWO.replace('radius="0.05"', "", 1), "link 'a' .* no 'radius'"),
+    "words for a limit": (TWO.replace('upper="1"', 'upper="far"', 1), "joint 'j1' .* 'far'"),
+    "words for a factor": (
+        chain(
+            joint("j1", "a", "b"),
+            joint("j2", "b", "c", extra='<mimic joint="j1" multiplier="half"/>'),
+        ),
+        "joint 'j2' .* 'half'",
+    ),
     "reversed limits": (
         chain(joint("j1", "a", "b", limit='<limit lower="2" upper="1" velocity="1"/>')),
         r"joint 'j1' .* limits \[2.0, 1.0\]",
@@ -104,7 +120,8 @@ MALFORMED = {
         "no joint of 'chain' moves",
     ),
     "negative radius": (TWO.replace('"0.05"', '"-0.05"'), "sphere of size .* must be positive"),
-    "capsule": (TWO.replace("<sphere", "<capsule"), "Unknown tag: capsule"),
+    "cone": (TWO.replace("<sphere", "<cone"), "link 'a' .* <cone>; read are .*'capsule'"),
+    "capsule without length": (TWO.replace("<sphere", "<capsule"), "link 'a' .* no 'length'"),
 }
 
 

@@ -56,9 +56,10 @@ def test_primitive_distance_equals_the_mesh_distance(solid):
     assert (mesh.bounds[1] <= upper + 1e-9).all()
 
 
+@pytest.mark.parametrize("map_", [random_map(1), None], ids=["map", "no map"])
 @pytest.mark.parametrize("solid", KNOWN, ids=lambda s: s.name)
-def test_known_primitives_are_obstacles(solid):
-    world = World(random_map(1), WorldConfig(known=(solid,), **FREE))
+def test_known_primitives_are_obstacles(solid, map_):
+    world = World(map_, WorldConfig(**FREE), known=[solid])
     field = world.field
     rng = np.random.default_rng(0)
     lower, upper = solid.box()
@@ -105,6 +106,26 @@ def test_solid_known_mesh_is_filled_and_open_one_is_not():
     shell.update_faces(np.arange(len(ball.faces)) != 0)
     hollow = World(map_, WorldConfig(known=(KnownMesh("shell", shell),), **FREE))
     assert hollow.field.lower_bound(probe)[0] > 0.0
+
+
+@pytest.mark.parametrize("turned", [0, 3])
+def test_a_known_mesh_of_ten_centimetres_is_as_near_as_it_is_to_two_millimetres(turned):
+    """At the grid's nodes: between them distances lose what those of any obstacle lose."""
+    size, pose = np.array([0.1, 0.07, 0.05]), _turned(turned, (0.1, 0.1, 0.3))
+    exact = Box("exact", size, pose)
+    mesh = trimesh.creation.box(size).apply_transform(pose)
+    world = World(random_map(1), WorldConfig(known=(KnownMesh("box", mesh),), **FREE))
+    field = world.source_field("known:box")
+    truth = exact.signed_distance(world.grid.slab(0, world.grid.shape[0]))
+    nodes = field.distance.reshape(-1)
+    assert (nodes <= np.maximum(truth, 0.0)).all()
+    assert (np.maximum(truth, 0.0) - np.maximum(nodes, 0.0)).max() <= 0.002
+    near = np.random.default_rng(0).normal(pose[:3, 3], 0.05, (5000, 3))
+    truth, bound = exact.signed_distance(near), field.lower_bound(near)
+    close = (truth > 0.0) & (truth < 0.03)
+    assert (bound[close] <= truth[close]).all()
+    assert (bound[truth <= 0.0] <= 0.0).all()
+    assert (truth - np.maximum(bound, 0.0))[close].mean() <= 0.0025
 
 
 def test_half_spaces_are_planes_after_the_support_surface():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The command line: `vprism-plan demo | map | plan | query | mesh | robot | view | warmup`.
+"""The command line: `vprism-plan demo | map | plan | query | mesh | export | robot | view`, ...
 
 Exit codes: 0 done, 1 no safe answer, 2 bad input, 130 interrupted; 3 is a defect of
 this program, with a traceback to report.
@@ -15,7 +15,7 @@ from vprism_plan.errors import VPrismError
 # The file of each command; there `run_COMMAND(command, console)` returns the exit code.
 _FILES = {
     "demo": "_plans", "map": "_maps", "mesh": "_maps", "plan": "_plans", "query": "_inspect",
-    "view": "_inspect", "robot": "_inspect", "warmup": "_warmup",
+    "export": "_maps", "view": "_inspect", "robot": "_inspect", "warmup": "_warmup",
 }  # fmt: skip
 DONE, NO_SAFE_ANSWER, BAD_INPUT, DEFECT, INTERRUPTED = 0, 1, 2, 3, 130
 

@@ -12,7 +12,7 @@ from vprism_plan._files import read_json, reading
 from vprism_plan.cli._console import Console
 from vprism_plan.cli._maps import load
 from vprism_plan.cli._parsing import Command
-from vprism_plan.cli._placing import Surroundings, standing
+from vprism_plan.cli._placing import Surroundings, read_robot, standing
 from vprism_plan.cli._plans import bake, checks
 from vprism_plan.errors import ConfigError, MapError, PlanningError
 
@@ -26,9 +26,8 @@ _OFTEN = 0.3  # of random configurations: a pair of links that overlaps in more 
 def run_query(command: Command, console: Console) -> int:
     """Answer for one configuration; exit code 0 if it is free, else 1."""
     from vprism_plan.collision import CollisionChecker
-    from vprism_plan.robots import Robot
 
-    robot = Robot.from_urdf(command.robot)
+    robot = read_robot(command)
     console.warn(robot.warnings)
     q = robot.check_configuration(command.q)
     config = checks(command, robot)
@@ -81,21 +80,14 @@ def run_query(command: Command, console: Console) -> int:
 
 def run_robot(command: Command, console: Console) -> int:
     """Read a robot, compare its spheres with its geometry; write what was asked for."""
-    from vprism_plan.robots import Robot
     from vprism_plan.robots.sphere_fit import SphereFit
 
     if command.fit and command.spheres is not None:
         raise ConfigError("--fit does not go with --spheres FILE; leave one of them out")
     began = time.perf_counter()
     with console.stage("robot"):
-        robot = Robot.from_urdf(
-            command.urdf,
-            srdf=command.srdf,
-            spheres="fit" if command.fit else command.spheres,
-            group=command.group,
-            package_dirs=command.package_dirs,
-            fit=SphereFit(tolerance=command.tolerance, max_spheres=command.max_spheres),
-        )
+        fit = SphereFit(tolerance=command.tolerance, max_spheres=command.max_spheres)
+        robot = read_robot(command, fit=fit, **({"spheres": "fit"} if command.fit else {}))
     with console.stage("report"):
         report = robot.report()
         shares = robot.touching_shares().items()
@@ -158,11 +150,10 @@ def run_view(command: Command, console: Console) -> int:
     Raises:
         VPrismError: nothing to show in the input, or a robot that does not fit it.
     """
-    from vprism_plan.robots import Robot
     from vprism_plan.viz.viewer import Viewer, require_viser
 
     require_viser()
-    robot = None if command.robot is None else Robot.from_urdf(command.robot)
+    robot = None if command.robot is None else read_robot(command)
     m, plan = _map_and_plan(command.input, console)
     trajectory, file = None, command.input / "trajectory.json"
     if robot is not None:

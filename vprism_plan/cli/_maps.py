@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Commands about the map itself: `map` and `mesh`."""
+"""Commands about the map itself: `map`, `mesh` and `export`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +28,7 @@ def fit_views(
     A folder of views stands for all of them; `asked` are options of `load_observation`.
 
     Raises:
-        ObservationError: a view cannot be used, none shows an object, or one of several is unposed.
+        ObservationError: a view cannot be used, or one of several is unposed.
     """
     from vprism_plan.mapping import MapConfig, fit_map
     from vprism_plan.perception import align_to_table, load_observation, segment_tabletop
@@ -46,8 +46,6 @@ def fit_views(
         if obs.labels is None:
             with console.stage("segment"):
                 views[number] = segment_tabletop(obs, seed=seed)
-        if len(views) == 1:
-            views[number].require_objects()
         if not obs.posed:
             with console.stage("align"):
                 views[number] = align_to_table(views[number], seed=seed)
@@ -86,7 +84,7 @@ def describe_map(m: "VPrismMap") -> dict[str, Any]:
         "objects": objects,
         "hinge_points": len(m.hinge_points),
         "iterations": len(m.history),
-        "bound": float(m.history[-1]),
+        "bound": float(m.history[-1]) if m.history else None,
         "views": len(m.views),
         "plane": {"normal": m.plane.normal, "offset": m.plane.offset},
     }
@@ -114,7 +112,7 @@ def run_map(command: Command, console: Console) -> int:
     }
     how = " (segmented from geometry)" if segmented else ""
     lines = [
-        f"{len(m.object_ids)} objects{how}: {', '.join(map(str, m.object_ids))}",
+        f"{len(m.object_ids)} objects{how}: {', '.join(map(str, m.object_ids))}".rstrip(": "),
         f"{len(m.hinge_points)} hinge points, {len(m.history)} iterations",
         console.time_line(),
         f"wrote {output} ({size / 1e6:.1f} MB)",
@@ -156,3 +154,31 @@ def run_mesh(command: Command, console: Console) -> int:
     }
     console.finish(payload, lines)
     return 0 if meshes else 1
+
+
+def run_export(command: Command, console: Console) -> int:
+    """Write the world or the trajectory; exit code 0."""
+    if command.input.suffix == ".json":
+        from vprism_plan.planning.trajectory import read_trajectory, write_message
+
+        names, trajectory = read_trajectory(command.input)
+        with console.stage("export"):
+            write_message(command.output, names, trajectory, command.frame_id)
+    else:
+        from vprism_plan.world import World, WorldConfig
+
+        bounds = None if command.bounds is None else np.reshape(command.bounds, (2, 3))
+        config = WorldConfig(
+            command.resolution, occluded=command.occluded, unobserved=command.unobserved,
+            bounds=bounds,
+        )  # fmt: skip
+        m = load(command.input, console)
+        with console.stage("bake"):
+            world = World(m, config)
+        console.warn(world.warnings)
+        with console.stage("export"):
+            world.export(command.output, command.frame_id)
+    size = command.output.stat().st_size
+    payload = {"output": command.output, "bytes": size, "timings": console.timings}
+    console.finish(payload, [console.time_line(), f"wrote {command.output} ({size / 1e6:.2f} MB)"])
+    return 0

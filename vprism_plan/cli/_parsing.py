@@ -73,7 +73,7 @@ def parse(arguments: Sequence[str]) -> Command:
         raise UsageError(f"no command given; see {PROGRAM} --help")
     parser = _Parser(PROGRAM, description=_DESCRIPTION)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for add in (_demo, _map, _plan, _query, _mesh, _view, _robot, _warmup):
+    for add in (_demo, _map, _plan, _query, _mesh, _export, _view, _robot, _warmup):
         lines = [line.strip() for line in (add.__doc__ or "").splitlines()]
         text = "\n".join(lines).strip()
         command = commands.add_parser(add.__name__[1:], help=lines[0], description=text)
@@ -115,11 +115,11 @@ def _plan(command: _Parser) -> None:
     """
     take = command.take
     take("VIEW", Path, "the view or the map", dest="input")
-    text = "robot description; an SRDF of the same name beside it is used"
-    take("--robot URDF", Path, text, required=True)
+    take("--robot URDF", Path, "robot description", required=True)
+    _description(command)
     _results(command, "out/plan")
     _base(command, "facing the objects")
-    text = "configuration (rad, m for sliding joints), in the URDF's joint order"
+    text = "configuration (rad, m for sliding joints), in the robot's joint order"
     take("--start Q ...", float, f"start {text}")
     take("--goal Q ...", float, f"goal {text}")
     text = "instead of a goal: pose of the end effector in the world (m, unit quaternion wxyz)"
@@ -144,7 +144,8 @@ def _query(command: _Parser) -> None:
     take = command.take
     take("MAP", Path, "a .safetensors map", dest="map")
     take("--robot URDF", Path, "robot description", required=True)
-    text = "configuration (rad, m for sliding joints), in the URDF's joint order"
+    _description(command)
+    text = "configuration (rad, m for sliding joints), in the robot's joint order"
     take("--q Q ...", float, text, required=True)
     _base(command, "where `plan` puts it, facing the objects")
     take("--margin M", float, "clearance that is required, m", 0.0)
@@ -163,6 +164,25 @@ def _mesh(command: _Parser) -> None:
     take("--resolution M", float, "edge of the grid, m", 0.01)
 
 
+def _export(command: _Parser) -> None:
+    """Write a map's world, or a planned trajectory, for another stack; the suffix says as what.
+
+    A world: .bt .ot (OctoMap), .scene .yaml (MoveIt's planning scene), .npz (distance field and
+    occupancy), .obj .glb .stl .ply (surfaces), .usd .usda .usdc. A trajectory.json of `plan`:
+    .json .yaml (JointTrajectory), .cdr (the bytes of that message in ROS 2). Nothing that is an
+    obstacle is free in the file; outside of its box it says nothing. OctoMap, USD and .cdr need
+    the extra `export`.
+    """
+    take = command.take
+    take("MAP_OR_TRAJECTORY", Path, "a .safetensors map, or trajectory.json", dest="input")
+    take("--output FILE", Path, "file to write", required=True)
+    take("--resolution M", float, "edge of a cell, m", 0.01)
+    text = "lower and upper corner of the box, m; default: around the objects"
+    take("--bounds X Y Z X Y Z", float, text)
+    take("--frame-id NAME", str, "name of the world frame", "world")
+    _policies(command)
+
+
 def _view(command: _Parser) -> None:
     """Look at a map, and at a plan, in the browser; Ctrl-C ends it.
 
@@ -175,6 +195,7 @@ def _view(command: _Parser) -> None:
     take("MAP_OR_PLAN", Path, text, dest="input")
     text = "robot description; for a plan, the one it was made with; without it none is shown"
     take("--robot URDF", Path, text)
+    _description(command)
     _base(command, "that of the plan, else where `plan` puts it")
     take("--level P", float, "P(occupied) at the surfaces, to begin with", 0.5)
     text = "address to listen at; 0.0.0.0 lets other machines connect"
@@ -190,23 +211,13 @@ def _robot(command: _Parser) -> None:
     how far they stand out of it.
     """
     take = command.take
-    take("URDF", Path, "the robot description (xacro expanded)", dest="urdf")
-    text = "groups, states, pairs not to test; default STEM.srdf beside the URDF, else generated"
-    take("--srdf SRDF", Path, text)
-    text = "collision spheres: YAML of this package or of cuRobo, or XRDF"
-    take("--spheres FILE", Path, text)
+    take("URDF", Path, "the robot description (xacro expanded)", dest="robot")
+    _description(command)
     take("--fit", bool, "fit spheres even if there is a file of them beside the URDF")
     text = "how far fitted spheres may stand out of a link, m, where --max-spheres suffice"
     take("--tolerance M", float, text, 0.03)
     text = "at most so many fitted spheres a link; default 12, more for links above 0.35 m"
     take("--max-spheres N", int, text)
-    text = 'SRDF group whose joints make a configuration; default "arm", else all joints'
-    take("--group NAME", str, text)
-    text = (
-        "folders that hold the packages of package:// names; folders above the URDF and "
-        "ROS_PACKAGE_PATH, AMENT_PREFIX_PATH are searched in any case"
-    )
-    take("--package-dirs DIR ...", Path, text, ())
     text = "write the spheres; as STEM_spheres.yml beside the URDF they are read from then on"
     take("--spheres-output FILE", Path, text)
     text = 'write an SRDF with the joints as group "arm" and the pairs that are not tested'
@@ -217,6 +228,23 @@ def _robot(command: _Parser) -> None:
 
 def _warmup(command: _Parser) -> None:
     """Compile the kernels now, on all cores, so that no later command waits for that."""
+
+
+def _description(command: _Parser) -> None:
+    """What belongs to a URDF."""
+    text = "groups, states, pairs not to test; default STEM.srdf beside the URDF, else generated"
+    command.take("--srdf SRDF", Path, text)
+    text = "collision spheres: YAML of this package, a robot file of cuRobo, or XRDF"
+    command.take("--spheres FILE", Path, text)
+    text = (
+        'SRDF group whose joints make a configuration; default: of the file of spheres, "arm", all'
+    )
+    command.take("--group NAME", str, text)
+    text = (
+        "folders that hold the packages of package:// names; folders above the URDF and "
+        "ROS_PACKAGE_PATH, AMENT_PREFIX_PATH are searched in any case"
+    )
+    command.take("--package-dirs DIR ...", Path, text, ())
 
 
 def _results(command: _Parser, folder: str) -> None:
@@ -262,6 +290,10 @@ def _rules(command: _Parser) -> None:
     command.take("--max-risk P", float, text, 0.1)
     text = "contacts to allow: a link or group of the robot and an object's id, as hand:3"
     command.take("--allow LINK:ID ...", str, text, ())
+    _policies(command)
+
+
+def _policies(command: _Parser) -> None:
     text = "what space behind visible surfaces counts as"
     command.take("--occluded POLICY", ("occupied", "posterior", "free"), text, "posterior")
     text = "what space outside the image counts as"

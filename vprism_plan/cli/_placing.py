@@ -37,7 +37,7 @@ class Surroundings:
 
     @classmethod
     def of(cls, m: "VPrismMap") -> "Surroundings":
-        """Measure the labelled points of a map.
+        """Measure the labelled points of a map; of one without objects, the middle of the table.
 
         Raises:
             PlanningError: the world is not z up, so nothing can be placed on the table.
@@ -48,8 +48,7 @@ class Surroundings:
                 f"the table's normal is {np.round(normal, 3).tolist()} in this map, but a base is "
                 "placed for a world with z up; give --base-xyz, or a view without a camera pose"
             )
-        seen = [view.points() for view in m.views]
-        points = np.concatenate([p[labels > 0] for p, labels in seen])
+        points = m.shown()
         low, high = np.percentile(points, [1.0, 99.0], axis=0)
         middle = 0.5 * (low + high)[:2]
         table = (m.plane.offset - float(normal[:2] @ middle)) / float(normal[2])
@@ -85,6 +84,14 @@ def candidate_bases(
             distance = max(share * reach, around.half_width(direction) + 0.2)
             xy = around.middle + distance * direction
             yield around.base_pose([*xy, around.table], yaw)
+
+
+def read_robot(command: Command, **options: Any) -> "Robot":
+    """Return the robot of a command's options; `options` as of `Robot.from_urdf` go before."""
+    from vprism_plan.robots import Robot
+
+    named = {name: getattr(command, name) for name in ("srdf", "spheres", "group", "package_dirs")}
+    return Robot.from_urdf(command.robot, **named | options)
 
 
 def places(

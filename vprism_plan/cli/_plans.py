@@ -13,7 +13,7 @@ from vprism_plan._resources import data_path, urdf_path
 from vprism_plan.cli._console import Console, dump_json, staged
 from vprism_plan.cli._maps import asked_of, describe_map, fit_views, load, write_meshes
 from vprism_plan.cli._parsing import Command
-from vprism_plan.cli._placing import Surroundings, choose_ends, places
+from vprism_plan.cli._placing import Surroundings, choose_ends, places, read_robot
 from vprism_plan.cli._warmup import compile_checks_meanwhile
 from vprism_plan.errors import PlanningError
 
@@ -74,10 +74,9 @@ def run_plan(command: Command, console: Console) -> int:
     """Plan and write the results; exit code 0, or 1 without a verified path."""
     from vprism_plan.collision import CollisionChecker
     from vprism_plan.planning.planners import planner_kind
-    from vprism_plan.robots import Robot
 
     planner_kind(command.planner)  # before the long work, as all that may be wrong
-    robot = Robot.from_urdf(command.robot)
+    robot = read_robot(command)
     console.warn(robot.warnings)
     if command.goal is not None and command.goal_pose is not None:
         raise PlanningError("both --goal and --goal-pose are given; give one of them")
@@ -184,6 +183,7 @@ def solve(
     options = {"planner": command.planner, "time_limit": command.time_limit, "seed": command.seed}
     with console.stage("plan"):
         result = plan(checker, *ends, **options)
+    console.warn(result.warnings)
     world, robot, path, report = checker.world, checker.robot, result.path, result.report
     with staged(command.output, PLAN_FILES) as aside:
         with console.stage("mesh"):
@@ -221,7 +221,7 @@ def solve(
             "compiled_kernels": console.compiled,
         }
         if path is not None:
-            timed = time_parameterize(robot, path)
+            timed = time_parameterize(robot, path, checker=checker)
             write_trajectory(aside / "trajectory.json", robot, timed, frame_id="world")
             payload["trajectory"] = {"duration": timed.duration, "points": len(timed.times)}
             dense = dense_path(path, 0.01)

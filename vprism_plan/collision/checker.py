@@ -5,6 +5,7 @@ import copy
 import threading
 from dataclasses import replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from vprism_plan.errors import ConfigError
 from vprism_plan.world.grid import Chosen, Values
 
 _BATCH_CHUNK = 512
+_CHORD = 0.002  # metres that anything moves along a chord of a rounded corner, at most
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
 
 
@@ -213,6 +215,22 @@ class CollisionChecker(explain.Checker):
         too.
         """
         return self._check_motion(qa, qb, np.empty(4))
+
+    def check_blend(self, qa: Numbers, corner: Numbers, qb: Numbers) -> bool:
+        """Return whether a rounded corner is free: the parabola that leaves qa towards the corner,
+        and comes to qb from it. Its chords are checked, with as much more margin as they may be
+        left by, and links against each other at their ends, with what may happen between."""
+        a, c, b = (configuration(self.robot, q) for q in (qa, corner, qb))
+        arrays, sides = self.robot.arrays, np.abs(c - a) + np.abs(b - c)
+        n = max(8, int(np.ceil(motion.motion_bounds(arrays, sides[None])[0][0] / _CHORD)))
+        u = np.linspace(0.0, 1.0, n + 1)[:, None]
+        curve = (1.0 - u) ** 2 * a + 2.0 * u * (1.0 - u) * c + u**2 * b
+        off = np.abs(a - 2.0 * c + b) / (4.0 * n**2)
+        gaps = motion.motion_bounds(arrays, np.abs(np.diff(curve, axis=0)) + 2.0 * off)[1]
+        if (self.self_clearance_batch(curve[1:]) < self.config.self_margin + gaps).any():
+            return False
+        wider = self.with_extra_margin(float(motion.motion_bounds(arrays, off[None])[0][0]))
+        return all(wider.check_motion(p, q) for p, q in pairwise(curve))
 
     def check_motion_report(self, qa: Numbers, qb: Numbers) -> MotionReport:
         """Return the verdict on an edge with its tolerance and, when refused, the reason."""

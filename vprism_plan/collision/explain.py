@@ -16,6 +16,7 @@ from vprism_plan.collision.packing import (
     configurations,
 )
 from vprism_plan.collision.reports import Contact, Kind, StateReport, as_point
+from vprism_plan.robots.kinematics import outside_limits
 from vprism_plan.world.grid import Balls, Points, Values, Vector, window
 from vprism_plan.world.sources import policies, source_of
 from vprism_plan.world.visibility import UNSEEN, free_balls
@@ -137,7 +138,7 @@ def limit_contacts(robot: Any, q: Configuration) -> list[Contact]:
             detail = (
                 f"joint {name} is {value:g}, farther than {FARTHEST:g} from 0; count fewer turns"
             )
-        elif not robot.continuous[j] and not low <= value <= high:
+        elif outside_limits(robot, q)[j]:
             excess = float(max(low - value, value - high))
             detail = (
                 f"joint {name} is {value:.6g}, outside its limits [{low:.6g}, {high:.6g}] "

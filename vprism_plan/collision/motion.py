@@ -270,6 +270,8 @@ def max_safe_motion(checker: Any, q: Numbers, dq: Numbers, tolerance: float = 0.
     checked_tolerance(tolerance)
     march = _March(checker, q, dq, tolerance)
     safe, refused = march.run()
+    if refused is not None:  # what is refused may be as far beyond a limit as counts as on it
+        safe = max(0.0, min(safe, march.limit()))
     reason = None if refused is None else checker.explain(march.at(refused))
     gap = 0.0 if refused is None else (refused - safe) * march.motion
     gap = max(gap, 0.5 * march.step * march.motion if march.stepped else 0.0)
@@ -298,7 +300,7 @@ class _March:
         self.count += 1
         if not self.checker.is_valid(self.q):
             return 0.0, 0.0
-        end = self._limit()
+        end = self.limit()
         safe = 0.0
         while safe < 1.0:
             span = self._span(safe)
@@ -319,7 +321,7 @@ class _March:
             safe = float(steps[-1])
         return 1.0, None
 
-    def _limit(self) -> float:
+    def limit(self) -> float:
         """Return up to which fraction all joints keep their limits."""
         robot = self.checker.robot
         moves = (self.dq != 0.0) & ~np.asarray(robot.continuous)

@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike
 from vprism_plan._arguments import number
 from vprism_plan._kernels.checking import FARTHEST
 from vprism_plan.errors import RobotError
-from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, joint_values
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, Named, joint_values
+from vprism_plan.robots.pairs import pair_room
+from vprism_plan.robots.urdf import LIMIT_TOLERANCE
 from vprism_plan.world.grid import Vector
 
 # Arrays of joint values: of one configuration, of many, of a path.
@@ -29,8 +31,8 @@ Waypoints = Float[np.ndarray, "_ _"]
 _HEADER = 24
 MARGIN = 6  # where the floats of a packed world hold the clearance to keep
 AT_MOST = 200_000  # configurations that one query may ask about
-# An array, a tensor, a list or a tuple.
-Numbers = ArrayLike | Sequence[Any]
+# An array, a tensor, a list or a tuple; of one configuration also values by name.
+Numbers = ArrayLike | Sequence[Any] | Named
 
 # Kernel view of a world: distances at nodes and in blocks (metres, float32), (rules, x, y, z)
 # each, and the grid, plane and margin data.
@@ -66,8 +68,9 @@ def _prismatic_travel(arrays: KinematicArrays, frame: int) -> float:
     if arrays.kind[frame] != KIND_PRISMATIC:
         return 0.0
     joint = int(arrays.q_index[frame])
-    ends = arrays.q_mult[frame] * np.array([arrays.lower[joint], arrays.upper[joint]])
-    return float(np.max(np.abs(ends + arrays.q_offset[frame])))
+    ends = np.array([arrays.lower[joint], arrays.upper[joint]])
+    ends += (-LIMIT_TOLERANCE, LIMIT_TOLERANCE)
+    return float(np.max(np.abs(arrays.q_mult[frame] * ends + arrays.q_offset[frame])))
 
 
 def reach_table(arrays: KinematicArrays) -> Float[np.ndarray, "f l"]:
@@ -143,8 +146,8 @@ def pack_robot(
     n_links = len(arrays.link_frame)
     spheres = _turned(turned, arrays.sphere_frame, arrays.sphere_center, arrays.sphere_radius)
     bounding = _turned(turned, arrays.link_frame, arrays.link_center, arrays.link_radius)
-    limits = np.column_stack([arrays.lower, arrays.upper])
-    gaps = np.array([self_margin, *arrays.link_padding[arrays.pairs].sum(axis=1)])
+    limits = np.column_stack([arrays.lower - LIMIT_TOLERANCE, arrays.upper + LIMIT_TOLERANCE])
+    gaps = np.array([self_margin, *pair_room(arrays, arrays.pairs)])
     float_parts = [frames, spheres.T, bounding, limits, reach_table(arrays), gaps]
     frame_ints = np.column_stack([arrays.parent, arrays.kind, np.maximum(arrays.q_index, 0)])
     starts, ends = arrays.link_start[:-1], arrays.link_start[1:]
@@ -251,11 +254,13 @@ def waypoints(robot: Any, path: Numbers, single: bool = False) -> Waypoints:
         )
     for j in np.unique(robot.arrays.q_index[robot.arrays.kind == KIND_PRISMATIC]):
         low, high = rows[:, j].min(), rows[:, j].max()
-        if low < robot.lower[j] or high > robot.upper[j]:
+        least, most = robot.lower[j] - LIMIT_TOLERANCE, robot.upper[j] + LIMIT_TOLERANCE
+        if not least <= low <= high <= most:
+            excess = max(robot.lower[j] - low, high - robot.upper[j])
             raise RobotError(
                 f"prismatic joint {robot.joint_names[j]} goes from {low:.4f} to {high:.4f} m, "
-                f"outside its limits [{robot.lower[j]:.4f}, {robot.upper[j]:.4f}] m; its motion "
-                "is bounded only within them"
+                f"outside its limits [{robot.lower[j]:.4f}, {robot.upper[j]:.4f}] m by "
+                f"{excess:.3g}; its motion is bounded only within them"
             )
     return rows
 

@@ -25,7 +25,7 @@ from vprism_plan.mapping.em import (
 )
 from vprism_plan.mapping.features import FeatureSpace, block_features, sorted_hinges
 from vprism_plan.mapping.hinges import lattice_hinges, local_features, needed_nodes, surface_hinges
-from vprism_plan.mapping.posterior import VPrismMap
+from vprism_plan.mapping.posterior import VPrismMap, nothing
 from vprism_plan.mapping.prior import (
     FLAT_OCCUPANCY,
     Prior,
@@ -89,7 +89,8 @@ def fit_map(
     """Fit a map to one labelled view, or to several views of one scene in one world frame.
 
     Args:
-        observations: views with labels; object ids mean the same in all of them.
+        observations: views with labels; object ids mean the same in all of them. Where every label
+            is 0 the table is empty: the map has no objects, and says so in `warnings`.
         config: parameters; the default is calibrated for planning.
         seed: of all sampling. Same views, config and seed: same bits.
         prior: what is thought of the hidden side: "shape" for the package's own network, None
@@ -97,7 +98,7 @@ def fit_map(
             anything that answers like one.
 
     Raises:
-        ObservationError: no labels or no objects (see `segment_tabletop`).
+        ObservationError: no labels (see `segment_tabletop`), or labels of which none is an object.
         PlaneNotFoundError: no support plane is known and none can be fitted.
         MapError: the objects are too large for any lattice, or the seed is none.
     """
@@ -112,7 +113,10 @@ def _fit(
     known: Sequence[str] = (),
 ) -> VPrismMap:
     """`fit_map`; `known` are warnings of an earlier map of some of the views."""
-    problem = learning_problem(observations, config, seed)
+    views = _views(observations)
+    if views and not any(view.labels is None or (view.labels > 0).any() for view in views):
+        return _of_empty_table(views, config, seed, known)
+    problem = learning_problem(views, config, seed)
     config, views, ids, plane, space = (
         problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
     )  # fmt: skip
@@ -144,6 +148,19 @@ def _fit(
         config, ids, plane, views, space, posterior, seed,
         tuple(dict.fromkeys([*known, *problem.warnings])), field,
     )  # fmt: skip
+
+
+def _of_empty_table(
+    views: tuple[Observation, ...], config: MapConfig, seed: int, known: Sequence[str]
+) -> VPrismMap:
+    views = _usable(views)
+    plane = _support_plane(views, _checked_seed(seed))
+    views, warnings = examine(views, plane)
+    said = (
+        "no pixel has an object's label: the map has no objects, and what stands on the support "
+        "surface is background, an obstacle; if objects are there, label them (segment_tabletop)"
+    )
+    return nothing(config, plane, views, seed, tuple(dict.fromkeys([*known, *warnings, said])))
 
 
 def _guessing(prior: Any) -> Prior:
@@ -192,18 +209,22 @@ def learning_problem(
     Arguments and errors are those of `fit_map`.
     """
     views = _views(observations)
-    if not (is_whole(seed) and seed >= 0):
-        raise MapError(f"seed is {seed!r}; it must be a whole number from 0")
     views = _usable(views)
-    plane = _support_plane(views, seed)
+    plane = _support_plane(views, _checked_seed(seed))
     views, warnings = examine(views, plane)
-    object_ids = _object_ids(views)
+    object_ids = _object_ids(views) or views[0].require_objects()
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
     hinges, used, coarser = _hinges_within_budget(data, views, plane, config, rng)
     space = FeatureSpace(sorted_hinges(hinges), used.gamma, used.cutoff_radius)
     warnings = (*warnings, *_without_return(views, object_ids), *coarser)
     return LearningProblem(used, views, object_ids, plane, data, space, warnings)
+
+
+def _checked_seed(seed: Any) -> int:
+    if not (is_whole(seed) and seed >= 0):
+        raise MapError(f"seed is {seed!r}; it must be a whole number from 0")
+    return int(seed)
 
 
 def _views(observations: Any) -> tuple[Observation, ...]:
@@ -237,9 +258,10 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
             "this map's prior is one of your own; give it again: update(view, prior=...), or "
             "fit_map to ask the package's"
         )
-    if old.prior is not None or not set(seen) <= set(old.object_ids):
+    if old.prior is not None or not seen or not set(seen) <= set(old.object_ids):
         logger.info("all %d views are fitted together", len(views))
-        return _fit(views, config, old.seed, None if old.prior is None else prior, old.warnings)
+        guessed = old.prior is not None or not old.object_ids
+        return _fit(views, config, old.seed, prior if guessed else None, old.warnings)
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
@@ -450,15 +472,25 @@ def _usable(
             "several views need T_world_camera each; without it their frames differ"
         )
     for view in views:
-        view.require_objects()
-    views = drop_background(views, len(earlier))
-    _object_ids(views)
-    return views
+        _ids_in(view)
+    kept = drop_background(views, len(earlier))
+    for before, after in zip(views, kept, strict=True):
+        if before.object_ids:
+            after.require_objects()
+    return kept
 
 
 def _object_ids(views: Sequence[Observation]) -> tuple[int, ...]:
-    """Labels of the objects; every view shows at least one."""
-    return tuple(sorted({i for view in views for i in view.require_objects()}))
+    """Labels of the objects."""
+    return tuple(sorted({i for view in views for i in _ids_in(view)}))
+
+
+def _ids_in(view: Observation) -> tuple[int, ...]:
+    """Labels of the objects in a view: none where every label is 0, which says that it sees none;
+    ObservationError if it has no labels, or those of objects without any depth."""
+    if view.labels is not None and not (view.labels > 0).any():
+        return ()
+    return view.require_objects()
 
 
 def _without_return(views: Sequence[Observation], object_ids: tuple[int, ...]) -> list[str]:

@@ -17,13 +17,14 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
 from vprism_plan.mapping.config import MapConfig
-from vprism_plan.mapping.em import Posterior, Weights
+from vprism_plan.mapping.em import Posterior, Weights, diagonal_prior
 from vprism_plan.mapping.factors import correlate, dense, run_per_class
 from vprism_plan.mapping.features import FeatureSpace, block_extent, make_blocks
 from vprism_plan.mapping.prior import MOST, PriorField
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 
+_ON_PLANE = 0.02  # m from the support plane, of points that show an empty table
 _SURE = 0.01 - MOST  # log-odds up to which a guess is as sure of nothing as it can be
 Logits = Float[np.ndarray, "n k"]
 MAX_LOG_ODDS = 40.0  # exp(-40) is 4e-18: nothing a float64 probability could still tell from 0
@@ -40,7 +41,7 @@ class VPrismMap:
     Attributes:
         config: the parameters it was fitted with.
         object_ids: labels of the objects, sorted.
-        plane: support surface in the world frame.
+        plane: support surface in the world frame; None only of `nothing()`.
         views: every observation that was fitted.
         seed: the seed of the fit.
         warnings: what was odd about the views: sentences with the remedy.
@@ -51,7 +52,7 @@ class VPrismMap:
 
     config: MapConfig
     object_ids: tuple[int, ...]
-    plane: Plane
+    plane: Any  # a `Plane`, or None
     views: tuple[Observation, ...]
     space: FeatureSpace
     posterior: Posterior
@@ -100,6 +101,8 @@ class VPrismMap:
     def support_bounds(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Return the corners (m) of a box outside which `support` is exactly 0, and the prior's
         grids call everything empty: nothing of the objects is beyond it."""
+        if len(self.space.hinges) == 0:
+            return np.zeros(3), np.zeros(3)
         lower, upper = self.space.bounds
         if self.prior is None:
             return lower.copy(), upper.copy()
@@ -113,6 +116,16 @@ class VPrismMap:
         if self.prior is not None:
             mean[1:] += float(self.prior.elsewhere.max())
         return float(np.exp(self._normalised(mean[None], variance[None])[0, 1:]).sum())
+
+    def shown(self) -> Float[np.ndarray, "n 3"]:
+        """Return the points (m) that were labelled as objects; of an empty table two corners of a
+        box, around the middle half of what was seen of it."""
+        seen = [view.points() for view in self.views]
+        if self.object_ids or self.plane is None or not seen:
+            return np.concatenate([np.empty((0, 3)), *(p[labels > 0] for p, labels in seen)])
+        points = np.concatenate([p for p, _ in seen])
+        points = points[np.abs(self.plane.signed_distance(points)) < _ON_PLANE]
+        return np.quantile(points, [0.25, 0.75], axis=0) if len(points) else points
 
     # ------------------------------------------------------------------ predictions
     def predict_proba(self, points: Any) -> Any:
@@ -149,8 +162,8 @@ class VPrismMap:
         """Return the entropy (nats) of the class probabilities at points (N, 3) m: (N,)."""
         log_p = self._log_probabilities(points)
         if isinstance(log_p, Tensor):
-            return -(log_p.exp() * log_p).sum(dim=1).to(points.dtype)
-        return -(np.exp(log_p) * log_p).sum(axis=1)
+            return (0.0 - (log_p.exp() * log_p).sum(dim=1)).to(points.dtype)
+        return 0.0 - (np.exp(log_p) * log_p).sum(axis=1)
 
     def support(self, points: Any) -> Any:
         """Return the kernel mass at points (N, 3) m: the sum of all kernel values, no bias: (N,).
@@ -342,6 +355,20 @@ class VPrismMap:
                 for a in (self.space.hinges, self.posterior.mean, covariance)
             )
         return cache[device, dtype]
+
+
+def nothing(
+    config: MapConfig | None = None,
+    plane: Plane | None = None,
+    views: tuple[Observation, ...] = (),
+    seed: int = 0,
+    warnings: tuple[str, ...] = (),
+) -> VPrismMap:
+    """Return a map without objects: every place is empty, and it has no hinge points."""
+    config = MapConfig() if config is None else config
+    space = FeatureSpace(np.zeros((0, 3)), config.gamma, config.cutoff_radius)
+    empty = Posterior(diagonal_prior(space, np.zeros((1, 1)), np.ones(1)), ())
+    return VPrismMap(config, (), plane, views, space, empty, seed, warnings)
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:

@@ -9,12 +9,15 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses
+from vprism_plan.robots.kinematics import KIND_PRISMATIC, frame_poses, within_limits
 
 _DAMPING = 1e-2
 _LARGEST_STEP = 0.5
 # Names that mean "the point that is to reach a pose", in order of preference.
-_TIP_NAMES = ("tcp", "tool0", "tool", "ee_link", "ee", "tip", "end_effector", "hand")
+_TIP_NAMES = (
+    "tcp", "tool0", "tool", "ee_link", "ee", "tip", "end_effector", "end_effector_link", "hand",
+    "gripper_base", "flange",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -44,36 +47,33 @@ class Tip:
         return turned @ self.offset[:3, :3], turned @ self.offset[:3, 3] + t[:, self.frame]
 
 
-def find_tip(robot: Any, link: str | None, rng: np.random.Generator) -> Tip:
-    """Find the frame a link, or the end effector, is attached to; PlanningError without one."""
-    if not (hasattr(robot, "arrays") and hasattr(robot, "link_poses")):
+def find_tip(robot: Any, link: str | None) -> Tip:
+    """Find a link, or the end effector: the robot's `tool`, a link with a name of one, or what
+    hangs on the last joint if the robot is one chain; PlanningError without one."""
+    if not (hasattr(robot, "arrays") and hasattr(robot, "links")):
         who = type(robot).__name__
         raise PlanningError(f"a {who} has no kinematics; give the goal as joint values")
-    parent = robot.arrays.parent
-    two = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
-    links = [robot.link_poses(q) for q in two]
-    R, t = frame_poses(robot.arrays, two)
-    name = link
-    if link is None:
-        endings = [(n, e) for e in _TIP_NAMES for n in reversed(links[0])]
+    links, parent = robot.links, robot.arrays.parent
+    name = link or robot.tool
+    if name is None:
+        moving = [n for n in reversed(links) if links[n].frame > 0]  # not a locked arm's
+        endings = [(n, e) for e in _TIP_NAMES for n in moving]
         name = next((n for n, e in endings if n == e or n.endswith("_" + e)), None)
-    known = ", ".join(links[0])
+    last = set(range(len(parent))) - set(parent.tolist())
+    if name is None and len(last) == 1:
+        within = {n: at for n, at in links.items() if at.frame in last and n not in robot.attached}
+        leaves = within.keys() - {at.parent for at in within.values()}
+        name = leaves.pop() if len(leaves) == 1 else None
+    known = ", ".join(links)
     if name is None:
         raise PlanningError(f"no link looks like the end effector; name one (`link`): {known}")
-    if name not in links[0]:
+    if name not in links:
         raise PlanningError(f"{robot.name} has no link {name!r}; its links are {known}")
-    for frame in reversed(range(len(parent))):  # the deepest one that it does not move against
-        inverses = np.tile(np.eye(4), (2, 1, 1))
-        for i, inverse in enumerate(inverses):
-            inverse[:3, :3] = R[i, frame].T
-            inverse[:3, 3] = -R[i, frame].T @ t[i, frame]
-        offsets = [inverse @ links[i][name] for i, inverse in enumerate(inverses)]
-        if np.allclose(offsets[0], offsets[1], atol=1e-9):
-            chain = [frame] if frame > 0 else []
-            while chain and parent[chain[-1]] > 0:
-                chain.append(int(parent[chain[-1]]))
-            return Tip(frame, offsets[0], tuple(chain))
-    raise PlanningError(f"link {name!r} of {robot.name} is attached to no frame of the robot")
+    frame = links[name].frame
+    chain = [frame] if frame > 0 else []
+    while chain and parent[chain[-1]] > 0:
+        chain.append(int(parent[chain[-1]]))
+    return Tip(frame, links[name].T, tuple(chain))
 
 
 def descend(
@@ -86,14 +86,13 @@ def descend(
     configurations, and what is left of the error: metres, radians (0 where any orientation
     will do).
     """
-    free = np.asarray(robot.continuous, dtype=bool)
     for _ in range(iterations):
         error, J = _error_and_jacobian(robot.arrays, tip, targets, q)
         damped = J @ J.transpose(0, 2, 1) + _DAMPING**2 * np.eye(error.shape[1])
         step = np.einsum("nji,nj->ni", J, np.linalg.solve(damped, error[..., None])[..., 0])
         largest = np.max(np.abs(step), axis=1, keepdims=True)
         q = q + step * np.minimum(1.0, _LARGEST_STEP / np.maximum(largest, 1e-300))
-        q = np.where(free, q, np.clip(q, robot.lower, robot.upper))
+        q = within_limits(robot, q)
     error, _ = _error_and_jacobian(robot.arrays, tip, targets, q)
     return q, np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
 

@@ -15,12 +15,18 @@ from vprism_plan._arguments import number, rigid_pose, whole
 from vprism_plan.errors import PlanningError, RobotError
 from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip
 from vprism_plan.planning.ompl_adapter import nearest_turns
-from vprism_plan.planning.path import one_line, outside_limits
+from vprism_plan.planning.path import one_line
 from vprism_plan.planning.protocols import CheckerLike, Configuration
 from vprism_plan.planning.result import PlanReport, PlanResult, RefusedGoal
-from vprism_plan.robots.kinematics import frame_poses, joint_values
+from vprism_plan.robots.kinematics import (
+    frame_poses,
+    joint_values,
+    outside_limits,
+    within_limits,
+)
 
 _APART = 0.05  # solutions nearer to each other in every joint are one
+_BESIDE = 192  # configurations beside a refused start that are looked at
 
 
 @dataclass(frozen=True)
@@ -197,7 +203,7 @@ def _descended(
 ) -> tuple[Tip, np.ndarray, np.ndarray, np.ndarray]:
     """The link, and what `descend` makes of the reference and random starts."""
     rng = np.random.default_rng(seed)
-    tip = find_tip(robot, link, np.random.default_rng(seed))
+    tip = find_tip(robot, link)
     lower, upper = np.asarray(robot.lower), np.asarray(robot.upper)
     starts = rng.uniform(lower, upper, (config.attempts, robot.dof))
     starts[0] = reference
@@ -217,14 +223,17 @@ def _distinct(
 
 
 def configuration(q: Any, robot: Any, what: str) -> Configuration:
-    """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong."""
+    """Return a fresh float64 copy of q, or raise PlanningError naming what is wrong.
+
+    What is beyond a limit by no more than `LIMIT_TOLERANCE` is put on it.
+    """
     array = numbers(q, robot, what)
     if array.shape != (robot.dof,):
         joints = f"({robot.dof},), one value per joint: {', '.join(robot.joint_names)}"
         raise PlanningError(f"{what} has shape {array.shape}; it must be {joints}")
     if not np.isfinite(array).all():
         raise PlanningError(f"{what} is {array}; every joint value must be finite")
-    return array
+    return np.where(outside_limits(robot, array), array, within_limits(robot, array))
 
 
 def numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
@@ -235,10 +244,8 @@ def numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
         raise PlanningError(str(error)) from error
 
 
-def refuse(
-    checker: CheckerLike, q: Configuration, what: str, report: PlanReport
-) -> PlanResult | None:
-    """Return the refusal if q must not be used as start or goal, None if it may."""
+def _refusal(checker: CheckerLike, q: Configuration) -> tuple[str, Any] | None:
+    """Why q must not be used, and the checker's report on it; None if it may be."""
     robot = checker.robot
     # Outside the limits OMPL would refuse without a reason.
     bad = outside_limits(robot, q)
@@ -246,13 +253,45 @@ def refuse(
         return None
     outside = ", ".join(
         f"joint {robot.joint_names[i]} is {q[i]:.6g}, outside [{robot.lower[i]:.6g}, "
-        f"{robot.upper[i]:.6g}]"
+        f"{robot.upper[i]:.6g}] by {max(robot.lower[i] - q[i], q[i] - robot.upper[i]):.3g}"
         for i in np.flatnonzero(bad)
     )
     explanation = checker.explain(q)
-    message = f"{what} is invalid: {outside if explanation.valid else one_line(explanation)}"
+    return outside if explanation.valid else one_line(explanation), explanation
+
+
+def refuse(
+    checker: CheckerLike, q: Configuration, what: str, report: PlanReport
+) -> PlanResult | None:
+    """Return the refusal if q must not be used as start or goal, None if it may."""
+    refusal = _refusal(checker, q)
+    if refusal is None:
+        return None
     status: Any = f"invalid_{what}"
-    return PlanResult(None, status, report, message, explanation=explanation)
+    message = f"{what} is invalid: {refusal[0]}"
+    return PlanResult(None, status, report, message, explanation=refusal[1])
+
+
+def free_start(
+    checker: CheckerLike, q: Configuration, nudge: float, seed: int
+) -> tuple[Configuration, str]:
+    """Return q, or for one that is refused the nearest free configuration that is found, no joint
+    farther than `nudge` (radians or metres), and what to say of it; q and "" without one."""
+    refusal = _refusal(checker, q) if nudge > 0.0 else None
+    if refusal is None:
+        return q, ""
+    rng, wide = np.random.default_rng(seed), np.linspace(0.1, 1.0, _BESIDE)[:, None]
+    near = q + nudge * wide * rng.uniform(-1.0, 1.0, (_BESIDE, len(q)))
+    near = within_limits(checker.robot, near)
+    moves = np.abs(near - q).max(axis=1)
+    for k in np.argsort(moves):
+        if moves[k] <= nudge and checker.is_valid(near[k]):
+            away = f"{math.ceil(1e5 * moves[k]) / 100:g} mrad (mm) away"
+            return near[k], (
+                f"the start is refused ({refusal[0]}); the path begins at a free configuration "
+                f"beside it, with joints up to {away}, and the way there is not checked"
+            )
+    return q, ""
 
 
 def valid_goals(

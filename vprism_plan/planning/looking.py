@@ -100,14 +100,16 @@ def next_view(
 
     Raises:
         ConfigError: the checker has no bound on risk.
-        PlanningError: no views, or one that is no pose.
+        PlanningError: no views, one that is no pose, or no camera.
     """
     if getattr(checker, "max_risk", None) is None:
         raise ConfigError("next_view weighs risks: give a checker with max_risk, such as 0.1")
     poses = _checked_poses(views)
-    first = checker.world.map.views[0]
-    K = np.asarray(first.intrinsics if intrinsics is None else intrinsics, dtype=np.float64)
-    shape = first.depth.shape if shape is None else shape
+    seen = checker.world.map.views
+    if not seen and (intrinsics is None or shape is None):
+        raise PlanningError("the map has no view to take a camera from: give intrinsics and shape")
+    K = np.asarray(seen[0].intrinsics if intrinsics is None else intrinsics, dtype=np.float64)
+    shape = seen[0].depth.shape if shape is None else shape
     found = plan(checker, start, goal, **options) if result is None else result
     path = found.path if found.path is not None else found.approximate_path
     if path is None or found.status not in ("exact", "too_risky"):

@@ -16,18 +16,17 @@ from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from vprism_plan.planning.objectives import PathCost
 from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, Waypoints
 from vprism_plan.planning.result import PlanReport, PlanResult
+from vprism_plan.robots.kinematics import outside_limits
 
 Check = Callable[[np.ndarray, np.ndarray], bool]
 Edge = tuple[np.ndarray, np.ndarray]
 
 _log = logging.getLogger(__name__)
 
-_ROUNDING = 1e-9  # radians or metres beyond a joint limit that count as on it
 _MOST_CUTS, _FUTILE_CUTS = 120, 25
 _SNAP = 0.02  # share of the path: ends of a cut this near to a waypoint are moved onto it
 _WORTHWHILE = 1e-6
@@ -57,16 +56,7 @@ class MotionCheck:
             return False
         if not self._check(qa, qb):
             return False
-        return not outside_limits(self._robot, np.stack([qa, qb]), _ROUNDING).any()
-
-
-def outside_limits(
-    robot: Any, q: Float[np.ndarray, "... dof"], slack: float = 0.0
-) -> Bool[np.ndarray, "... dof"]:
-    """Return which values are beyond the limits of their joints by more than `slack`."""
-    low = q < np.asarray(robot.lower) - slack
-    high = q > np.asarray(robot.upper) + slack
-    return np.asarray((low | high) & ~np.asarray(robot.continuous, dtype=bool))
+        return not outside_limits(self._robot, np.stack([qa, qb])).any()
 
 
 def shorten(
@@ -253,7 +243,7 @@ def verified(
 ) -> PlanResult:
     """Check every edge of the final waypoints again, and measure the path."""
     began = now()
-    outside = outside_limits(checker.robot, path, _ROUNDING)
+    outside = outside_limits(checker.robot, path)
     verdicts: list[Any] = []
     for edge, (a, b) in enumerate(pairwise(path)):
         verdicts.append(checker.check_motion_report(a, b))

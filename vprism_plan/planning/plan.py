@@ -16,6 +16,7 @@ from vprism_plan.planning.goals import (
     PoseGoalConfig,
     ReachRegion,
     configuration,
+    free_start,
     numbers,
     refuse,
     valid_goals,
@@ -26,6 +27,7 @@ from vprism_plan.planning.planners import planner_kind, planners
 from vprism_plan.planning.protocols import CheckerLike, Configuration, Now, SecondOpinion
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import CLOCKS, SearchRequest
+from vprism_plan.robots.kinematics import Named
 
 _log = logging.getLogger(__name__)
 
@@ -41,8 +43,8 @@ _BOUNDS = (0.25, 0.5, 0.75, 0.95)  # ... by these bounds, in turn
 
 def plan(
     checker: CheckerLike,
-    start: ArrayLike | Sequence[float],
-    goal: ArrayLike | Sequence[float] | ReachRegion,
+    start: ArrayLike | Sequence[float] | Named,
+    goal: ArrayLike | Sequence[float] | Named | ReachRegion,
     planner: str = "RRTConnect",
     time_limit: float | int = 5.0,
     seed: int = 0,
@@ -60,6 +62,7 @@ def plan(
     objective: str | RiskObjective = "length",
     warm_start: bool = True,
     margins: Sequence[float] | str | None = "auto",
+    nudge: float | int = 0.005,
 ) -> PlanResult:
     """Plan a motion from `start` to `goal` and verify it.
 
@@ -73,7 +76,7 @@ def plan(
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
-        start: start configuration (dof,), radians or metres.
+        start: start configuration (dof,), radians or metres, or joint values by name.
         goal: goal configuration (dof,); or several, (g, dof), of which any will do; or the
             pose (4, 4) of the end effector in the world frame (for a robot of four joints: if
             its last row is 0 0 0 1); or a `ReachRegion`. `report.refused_goals` says which
@@ -118,6 +121,9 @@ def plan(
             problems that only the checker's own margin allows stay unsolved. The checker needs
             `with_extra_margin`. "auto": those, if the checker has it, for a short path by a planner
             that stops at its first; else none. None: none.
+        nudge: radians or metres. A start that is refused, as the arm touches something by a hair
+            or its encoders are off, may have a free configuration beside it, no joint farther
+            than this: then the path begins there, and `message` and `warnings` say so. 0: never.
 
     Returns:
         A `PlanResult`; `result.solved` is True only for a verified path to the goal.
@@ -132,7 +138,9 @@ def plan(
     number("simplify_time", simplify_time, 0.0, unit="s", finite=False, error=PlanningError)
     if second_opinion is not None:
         _require_same_robot(second_opinion, checker)
+    number("nudge", nudge, 0.0, 0.1, error=PlanningError)
     q_start = configuration(start, checker.robot, "start")
+    q_start, moved = free_start(checker, q_start, nudge, request.seed)
     now = CLOCKS[clock]
 
     def answer(judge: CheckerLike, limit: float, wider: tuple[float, ...] = ()) -> PlanResult:
@@ -169,9 +177,12 @@ def plan(
         values = numbers(goal, checker.robot, "goal")
         ends += [configuration(values, checker.robot, "goal")] if values.ndim == 1 else []
     result = _widest(checker, steps, ends, answer, (1.0 - bounded * _RISKIER) * limit, now)
-    if result.solved or not bounded or result.status == "too_risky":
+    if not (result.solved or not bounded or result.status == "too_risky"):
+        result = _riskier(checker, result, ends, answer, _RISKIER * limit)
+    if not moved:
         return result
-    return _riskier(checker, result, ends, answer, _RISKIER * limit)
+    message, warnings = f"{result.message}; {moved}", (*result.warnings, moved)
+    return replace(result, message=message, warnings=warnings)
 
 
 def _checked_margins(checker: CheckerLike, margins: Sequence[float]) -> list[float]:

@@ -121,9 +121,10 @@ class PlanResult:
     """The verdict on a planning query.
 
     Attributes:
-        path: verified waypoints (T, dof), radians and metres, start first; None unless the
-            status is "exact". Consecutive rows differ by the motion that was checked, so the
-            last row equals the goal up to whole turns of continuous joints.
+        path: verified waypoints (T, dof), radians and metres, start first (or a free configuration
+            beside it: `nudge` of `plan`); None unless the status is "exact". Consecutive rows
+            differ by the motion that was checked, so the last row equals the goal up to whole
+            turns of continuous joints.
         status: "exact" (path reaches the goal and every edge was re-verified),
             "approximate" (ended near the goal only), "timeout" (nothing found),
             "invalid_start", "invalid_goal" (in collision, or out of the joint limits),

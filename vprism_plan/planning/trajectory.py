@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""From a verified path to a timed trajectory that never leaves it.
+"""From a verified path to a timed trajectory.
 
-The checker certified straight lines in joint space. Blending corners would leave them, so the
-motion stops where the direction changes, and nowhere else. Between stops all joints share one
-trapezoidal profile along the line. Files hold `trajectory_msgs/JointTrajectory` in JSON.
+The checker certified straight lines in joint space. Without it the motion never leaves them: it
+stops where the direction changes, and nowhere else; between stops all joints share one trapezoidal
+profile along the line. With it corners are rounded to parabolas (constant acceleration from one
+line's velocity to the next one's), each where the checker accepts it. Files hold
+`trajectory_msgs/JointTrajectory` as JSON, YAML or in the bytes of ROS 2.
 """
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -19,8 +21,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import is_whole, number
-from vprism_plan._files import read_json, reading, write_text
-from vprism_plan.errors import PlanningError
+from vprism_plan._files import read_json, reading, replacing, write_text
+from vprism_plan.errors import PlanningError, importing
 from vprism_plan.planning.protocols import Configuration
 
 # Without stated acceleration limits a joint reaches its full speed in this time.
@@ -28,6 +30,7 @@ _SECONDS_TO_FULL_SPEED = 0.5
 # Unit directions closer than this are one line; the path is left by no more.
 _SAME_DIRECTION = 1e-9
 _NANOSECONDS = 10**9
+_SLOWER, _TRIES = 1.5, 6  # how, and how often, a corner that is refused is taken more slowly
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +38,7 @@ class Trajectory:
     """A motion over time, as cubic pieces.
 
     Every change of acceleration is a point, so cubic interpolation of positions and velocities,
-    as controllers do without accelerations, is the trapezoidal profile and stays on the path.
+    as controllers do without accelerations, is the motion itself.
 
     Attributes:
         times: (n,) seconds from the start, increasing, the first is 0.
@@ -74,18 +77,24 @@ def time_parameterize(
     velocity_limits: ArrayLike | None = None,
     acceleration_limits: ArrayLike | None = None,
     scale: float = 1.0,
+    checker: Any = None,
 ) -> Trajectory:
     """Time a path so that no joint exceeds its velocity or acceleration limit.
 
     Args:
-        robot: brings `joint_names` and the default `velocity_limits`.
+        robot: brings `joint_names` and the default limits.
         path: waypoints (t, dof), at least one, as in `PlanResult.path`.
         velocity_limits: (dof,) rad/s or m/s; the robot's own if None.
-        acceleration_limits: (dof,) per s^2; None: each joint is at full speed in half a second.
+        acceleration_limits: (dof,) per s^2; None: the robot's own, else a joint is at full speed
+            in half a second.
         scale: share of both limits to use, more than 0 and at most 1.
+        checker: the `CollisionChecker` of the path, where corners may be rounded: as fast as it
+            accepts, slower, or not at all. It is asked about each whole parabola, with margin for
+            what straight pieces leave out, and for its `max_risk` about the whole motion.
 
     Returns:
-        At rest at both ends and at every corner; on the path, through every waypoint.
+        At rest at both ends. Without a checker on the path, through every waypoint, at rest at
+        every corner; with one beside the path at rounded corners.
 
     Raises:
         PlanningError: the path or a limit is not usable; names the joint and the value.
@@ -101,13 +110,32 @@ def time_parameterize(
     given = robot.velocity_limits if velocity_limits is None else velocity_limits
     speed = _limits("velocity", given, names)
     push = speed / _SECONDS_TO_FULL_SPEED
+    stated = getattr(robot, "acceleration_limits", None)
+    if acceleration_limits is None and stated is not None:
+        acceleration_limits = np.where(np.isfinite(stated), stated, push)
     if acceleration_limits is not None:
         push = _limits("acceleration", acceleration_limits, names)
 
-    points = [(0.0, path[0], np.zeros(len(names)))]
-    for line in _straight_lines(path):
+    if checker is not None and not hasattr(checker, "check_blend"):
+        needed = "a CollisionChecker judges rounded corners"
+        raise PlanningError(f"checker is a {type(checker).__name__}; {needed}")
+    lines = list(_straight_lines(path))
+    if checker is not None and len(lines) > 1:
+        corners = np.array([path[0], *(line[-1] for line in lines)])
+        rounded = _joined(path[0], [_rounded(corners, scale * speed, scale * push, checker)])
+        most = checker.config.max_risk
+        every = np.union1d(np.arange(0.0, rounded.duration, 0.01), rounded.times)
+        if most is None or checker.collision_probability(rounded.sample(every)[0]).upper <= most:
+            return rounded
+    return _joined(path[0], (_timed(line, scale * speed, scale * push) for line in lines))
+
+
+def _joined(start: Configuration, pieces: Iterable[Iterable[Any]]) -> Trajectory:
+    """Join pieces of (time, position, velocity), each from rest, its start left out."""
+    points = [(0.0, start, np.zeros(len(start)))]
+    for piece in pieces:
         began = points[-1][0]
-        points += [(began + t, q, v) for t, q, v in _timed(line, scale * speed, scale * push)]
+        points += [(began + t, q, v) for t, q, v in piece]
     times, positions, velocities = map(np.array, zip(*points, strict=True))
     return Trajectory(times, positions, velocities)
 
@@ -186,10 +214,60 @@ def _timed(
     yield total, line[-1], 0.0 * whole
 
 
+def _rounded(
+    corners: Float[np.ndarray, "n dof"], speed: Configuration, push: Configuration, checker: Any
+) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Return (time, position, velocity) along straight lines with rounded corners, the start left
+    out. A corner that stays refused is a stop, and its two sides are timed apart."""
+    delta = np.diff(corners, axis=0)
+    least = (np.abs(delta) / speed).max(axis=1)
+    for _ in range(_TRIES):
+        times, blends, speeds = _cruise(delta, least, push)
+        start = corners - 0.5 * blends[:, None] * speeds[:-1]
+        end = corners + 0.5 * blends[:, None] * speeds[1:]
+        inner = range(1, len(delta))
+        refused = [i for i in inner if not checker.check_blend(start[i], corners[i], end[i])]
+        if not refused:
+            break
+        for i in refused:
+            least[i - 1 : i + 1] = _SLOWER * times[i - 1 : i + 1]
+    else:
+        parts = corners[: refused[0] + 1], corners[refused[0] :]
+        points, more = (_rounded(part, speed, push, checker) for part in parts)
+        return points + [(points[-1][0] + t, q, v) for t, q, v in more]
+    half = 0.5 * blends
+    middle = half[0] + np.concatenate([[0.0], np.cumsum(times)])
+    t = np.stack([middle - half, middle + half], axis=1).ravel()
+    sides = (start, end), (speeds[:-1], speeds[1:])
+    q, v = (np.stack(pair, axis=1).reshape(len(t), -1) for pair in sides)
+    kept = 1 + np.flatnonzero(np.diff(t) > 1e-9 * t[-1])  # two blends may leave a line no room
+    return list(zip(t[kept], q[kept], v[kept], strict=True))
+
+
+def _cruise(
+    delta: Float[np.ndarray, "n dof"], least: Float[np.ndarray, " n"], push: Configuration
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"], Float[np.ndarray, "k dof"]]:
+    """Return how long each line would take at its constant speed, at least `least`; how long each
+    change of speed takes, so that half of both at its ends fit into each line; all speeds, those of
+    the rests before and after with them."""
+    times = least.copy()
+    for steps in range(100, -1, -1):
+        speeds = np.pad(delta / times[:, None], ((1, 1), (0, 0)))
+        blends = (np.abs(np.diff(speeds, axis=0)) / push).max(axis=1)
+        short = np.sqrt(np.maximum(0.5 * (blends[:-1] + blends[1:]) / times, 1.0))
+        if short.max() == 1.0:
+            break
+        # All of them slower by one factor fit in any case: blends get shorter as lines get longer.
+        times *= np.where(short > 1.0, 1.001 * short, 1.0) if steps > 1 else 1.001 * short.max()
+    return times, blends, speeds
+
+
 def write_trajectory(
     path_file: str | Path, robot: Any, trajectory: Trajectory, frame_id: str = ""
 ) -> None:
-    """Write a trajectory as `trajectory_msgs/JointTrajectory`, whole or not at all.
+    """Write a trajectory as `trajectory_msgs/JointTrajectory`, whole or not at all: as YAML
+    (`.yaml`, `.yml`), as CDR (`.cdr`: bytes that a ROS 2 publisher takes as they are; extra
+    `export`), else as JSON.
 
     Accelerations and efforts stay empty, which the message allows: given accelerations,
     controllers fit quintics, which a trapezoidal profile is not. Joint motions need no
@@ -198,8 +276,16 @@ def write_trajectory(
     Raises:
         PlanningError: joints and columns differ in number, or two points fall on the
             same nanosecond.
+        MissingDependencyError: rosbags is not installed.
     """
-    names = [str(name) for name in robot.joint_names]
+    write_message(path_file, robot.joint_names, trajectory, frame_id)
+
+
+def write_message(
+    path_file: str | Path, joint_names: Iterable[str], trajectory: Trajectory, frame_id: str = ""
+) -> None:
+    """`write_trajectory` for joints of these names."""
+    names = [str(name) for name in joint_names]
     if trajectory.positions.shape[1:] != (len(names),):
         given = f"{trajectory.positions.shape[1:]} joints"
         raise PlanningError(f"the trajectory has {given}, the robot {', '.join(names)}")
@@ -218,7 +304,45 @@ def write_trajectory(
     ]
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame_id}
     message = {"header": header, "joint_names": names, "points": points}
-    write_text(path_file, json.dumps(message, indent=1, allow_nan=False) + "\n")
+    suffix = Path(path_file).suffix.lower()
+    if suffix == ".cdr":
+        serialized = _cdr(message)
+        with replacing(path_file) as temporary:
+            temporary.write_bytes(serialized)
+    elif suffix in (".yaml", ".yml"):
+        import yaml  # type: ignore[import-untyped]
+
+        write_text(path_file, yaml.safe_dump(message, default_flow_style=None, sort_keys=False))
+    else:
+        write_text(path_file, json.dumps(message, indent=1, allow_nan=False) + "\n")
+
+
+def _cdr(message: dict[str, Any]) -> bytes:
+    """Serialize a message as ROS 2 sends it, little-endian."""
+    with importing("rosbags", "export"):
+        from rosbags.typesys import Stores, get_typestore
+    store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def make(name: str, **values: Any) -> Any:
+        return store.types[name](**values)
+
+    def of(kind: str, time: dict[str, int]) -> Any:
+        return make(f"builtin_interfaces/msg/{kind}", **time)
+
+    header = message["header"]
+    stamp = of("Time", header["stamp"])
+    points = [
+        make(
+            "trajectory_msgs/msg/JointTrajectoryPoint",
+            time_from_start=of("Duration", point["time_from_start"]),
+            **{k: np.array(v, np.float64) for k, v in point.items() if k != "time_from_start"},
+        )
+        for point in message["points"]
+    ]
+    kind = "trajectory_msgs/msg/JointTrajectory"
+    stamped = make("std_msgs/msg/Header", stamp=stamp, frame_id=header["frame_id"])
+    whole = make(kind, header=stamped, joint_names=message["joint_names"], points=points)
+    return bytes(store.serialize_cdr(whole, kind))
 
 
 def read_trajectory(path_file: str | Path) -> tuple[tuple[str, ...], Trajectory]:

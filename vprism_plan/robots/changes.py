@@ -46,7 +46,7 @@ def padded(
     arrays = dataclasses.replace(arrays, pairs=_with_pairs(arrays, added))
     geometry, meshes = dict(robot.geometry), dict(robot.meshes)
     for index, name in enumerate(names):
-        T, factor, pad = robot._links[name].T, float(scales[index]), float(pads[index])
+        T, factor, pad = robot.links[name].T, float(scales[index]), float(pads[index])
         about = (robot.arrays.link_center[index] - T[:3, 3]) @ T[:3, :3]
         if name in geometry:
             geometry[name] = tuple(solid.grown(about, factor, pad) for solid in geometry[name])
@@ -157,23 +157,27 @@ def attached(
     """See :meth:`Robot.attach`."""
     what = f"attached object {name!r}"
     held = _held(what, spheres, mesh, max_spheres)
-    if not isinstance(name, str) or not name or name in robot._links or name in robot.groups:
+    if not isinstance(name, str) or not name or name in robot.links or name in robot.groups:
         raise RobotError(f"{what}: an object needs a name of its own, no link's or group's")
-    if link not in robot._links:
-        raise RobotError(f"{what}: no link {link!r}; links: {sorted(robot._links)}")
+    if link not in robot.links:
+        raise RobotError(f"{what}: no link {link!r}; links: {sorted(robot.links)}")
     if isinstance(touch_links, str):
         raise RobotError(f"{what}: touch_links is the string {touch_links!r}; give a sequence")
     T = rigid_pose(f"{what}: pose", np.eye(4) if pose is None else pose, error=RobotError)
-    carrier = robot._links[link]
-    sits = Attachment(carrier.frame, carrier.T @ T)
+    carrier = robot.links[link]
+    sits = Attachment(carrier.frame, carrier.T @ T, link)
     siblings = [other for other, parent in robot.attached.items() if parent == link]
     reasons = dict.fromkeys(siblings, "Attached to the same link") | {link: "Attached"}
     for entry in touch_links:
-        members = (entry,) if entry in robot._links else robot.groups.get(entry)
+        members = (entry,) if entry in robot.links else robot.groups.get(entry)
         for touched in robot.links_of(entry) if members is None else members:
             reasons.setdefault(touched, "Touch link")
     tested = [i for i, other in enumerate(robot.link_names) if other not in reasons]
-    arrays = _with_link(robot.arrays, sits, held.spheres, tested)
+    below = link
+    while below in robot.attached:
+        below = robot.attached[below]
+    moves = carrier.frame > 0 or (robot.check_locked and below in robot._parts.model.moved)
+    arrays = _with_link(robot.arrays, sits, held.spheres, tested, not moves)
     names = (*robot.link_names, name)
     touching = [p for p in touching_pairs(arrays, robot.neutral, names) if name in p]
     if touching:
@@ -190,7 +194,7 @@ def attached(
         arrays=arrays,
         attached=robot.attached | {name: link},
         held=robot.held | {name: held},
-        _links=robot._links | {name: sits},
+        links=robot.links | {name: sits},
     )
 
 
@@ -215,7 +219,7 @@ def detached(robot: Any, name: str) -> Any:
         arrays=arrays,
         attached={other: link for other, link in robot.attached.items() if other != name},
         held={other: shape for other, shape in robot.held.items() if other != name},
-        _links={link: sits for link, sits in robot._links.items() if link != name},
+        links={link: sits for link, sits in robot.links.items() if link != name},
     )
 
 
@@ -230,7 +234,7 @@ def _held(what: str, spheres: Any, mesh: Any, max_spheres: int) -> Held:
 
 
 def _with_link(
-    arrays: KinematicArrays, sits: Attachment, rows: Spheres, tested: Sequence[int]
+    arrays: KinematicArrays, sits: Attachment, rows: Spheres, tested: Sequence[int], fixed: bool
 ) -> KinematicArrays:
     """Add a link at the end: spheres in its own frame, to be tested against some links."""
     local, radii, center, radius = in_frame(sits, rows)
@@ -245,8 +249,9 @@ def _with_link(
         link_frame=np.append(arrays.link_frame, sits.frame),
         link_center=np.vstack([arrays.link_center, center]),
         link_radius=np.append(arrays.link_radius, radius),
-        link_fixed=np.append(arrays.link_fixed, sits.frame == 0),
+        link_fixed=np.append(arrays.link_fixed, fixed),
         link_padding=np.append(arrays.link_padding, 0.0),
+        link_buffer=np.append(arrays.link_buffer, 0.0),
         pairs=_with_pairs(arrays, [(other, index) for other in tested]),
     )
 

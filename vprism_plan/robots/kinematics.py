@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,7 +14,7 @@ from vprism_plan._read_only import make_read_only
 from vprism_plan._shapes import Configurations, Indices, Points, Pose, Spheres, Values, Vector
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.sphere_files import LinkSpheres
-from vprism_plan.robots.urdf import RobotModel
+from vprism_plan.robots.urdf import LIMIT_TOLERANCE, RobotModel
 
 if TYPE_CHECKING:
     import torch
@@ -54,9 +54,10 @@ class KinematicArrays:
         link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
         link_frame: Frame each link moves with.
         link_center, link_radius: A ball that holds all spheres of the link.
-        link_fixed: True where no joint moves the link.
+        link_fixed: True for links that are not checked against the world: no joint moves them.
         link_padding: Metres of each link's radii that are padding. They count against the
             world; a pair's gap is that of its spheres plus the padding of both links.
+        link_buffer: Metres that each link keeps from others, not in its radii.
         pairs: Link pairs (first < second) to test for self-collision.
         lower, upper: Joint limits; -pi and pi for continuous joints.
         continuous: True where the joint turns without limit.
@@ -82,6 +83,7 @@ class KinematicArrays:
     link_radius: Float[np.ndarray, "links"]
     link_fixed: Bool[np.ndarray, "links"]
     link_padding: Float[np.ndarray, "links"]
+    link_buffer: Float[np.ndarray, "links"]
     pairs: Int[np.ndarray, "pairs 2"]
     lower: Float[np.ndarray, "dof"]
     upper: Float[np.ndarray, "dof"]
@@ -98,10 +100,11 @@ class KinematicArrays:
 
 @dataclass(frozen=True)
 class Attachment:
-    """Where a link sits: constant pose ``T`` in the moving frame ``frame``."""
+    """Where a link sits: constant pose ``T`` in the moving frame ``frame``, below ``parent``."""
 
     frame: int
     T: np.ndarray
+    parent: str = ""
 
 
 def rotation(
@@ -120,6 +123,7 @@ def build_arrays(
     locked: Mapping[str, float],
     spheres: LinkSpheres,
     base_pose: Pose,
+    buffer: Mapping[str, float],
 ) -> tuple[KinematicArrays, dict[str, Attachment]]:
     """Flatten a robot into arrays without pairs, and say where each URDF link sits.
 
@@ -133,21 +137,21 @@ def build_arrays(
         parent = links[joint.parent]
         T = parent.T @ joint.T_origin
         if not joint.moves:
-            links[joint.child] = Attachment(parent.frame, T)
+            links[joint.child] = Attachment(parent.frame, T, joint.parent)
             continue
         driver, factor, shift = model.resolve_mimic(joint.name)
         if driver in active:
             kind = KIND_PRISMATIC if joint.kind == "prismatic" else KIND_REVOLUTE
             index = list(active).index(driver)
             frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
-            links[joint.child] = Attachment(len(frames) - 1, np.eye(4))
+            links[joint.child] = Attachment(len(frames) - 1, np.eye(4), joint.parent)
         else:
             value, motion = np.float64(factor * locked[driver] + shift), np.eye(4)
             if joint.kind == "prismatic":
                 motion[:3, 3] = value * joint.axis
             else:
                 motion[:3, :3] = rotation(joint.axis, value)
-            links[joint.child] = Attachment(parent.frame, T @ motion)
+            links[joint.child] = Attachment(parent.frame, T @ motion, joint.parent)
     chosen = [model.joint_map[name] for name in active]
     centers, radii, ball_centers, ball_radii = zip(
         *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
@@ -178,6 +182,7 @@ def build_arrays(
         link_radius=np.array(ball_radii),
         link_fixed=link_frame == 0,
         link_padding=np.zeros(len(link_frame)),
+        link_buffer=np.array([buffer.get(name, 0.0) for name in spheres]),
         pairs=np.empty((0, 2), dtype=np.int64),
         lower=np.array([joint.lower for joint in chosen]),
         upper=np.array([joint.upper for joint in chosen]),
@@ -245,7 +250,8 @@ def only_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
     starts = np.concatenate([[0], np.cumsum(counts)])
     rows = np.arange(starts[-1]) + np.repeat(arrays.link_start[links] - starts[:-1], counts)
     of_spheres = ("sphere_frame", "sphere_center", "sphere_radius")
-    of_links = ("link_frame", "link_center", "link_radius", "link_fixed", "link_padding")
+    of_links = [field.name for field in fields(arrays) if field.name.startswith("link_")]
+    of_links.remove("link_start")
     return replace(
         arrays,
         **{name: getattr(arrays, name)[rows] for name in of_spheres},
@@ -263,6 +269,7 @@ def reach_bound(arrays: KinematicArrays) -> float:
         reach[f] = reach[arrays.parent[f]] + np.linalg.norm(arrays.t_off[f])
         if arrays.kind[f] == KIND_PRISMATIC:
             ends = np.array([arrays.lower[arrays.q_index[f]], arrays.upper[arrays.q_index[f]]])
+            ends += (-LIMIT_TOLERANCE, LIMIT_TOLERANCE)
             reach[f] += np.abs(arrays.q_mult[f] * ends + arrays.q_offset[f]).max()
     outer = np.linalg.norm(arrays.sphere_center, axis=1) + arrays.sphere_radius
     return float((reach[arrays.sphere_frame] + outer).max())
@@ -340,6 +347,30 @@ def _torch_chain(
     return chain, *of_joints, frame, tensor(arrays.sphere_center)
 
 
+def within_limits(robot: Any, q: Float[np.ndarray, "... dof"]) -> Float[np.ndarray, "... dof"]:
+    """Return q with values beyond a limit put on it."""
+    free = np.asarray(robot.continuous, dtype=bool)
+    return np.where(free, q, np.clip(q, robot.lower, robot.upper))
+
+
+def outside_limits(robot: Any, q: Float[np.ndarray, "... dof"]) -> Bool[np.ndarray, "... dof"]:
+    """Return which values are beyond the limits of their joints by more than the tolerance."""
+    low = q < np.asarray(robot.lower) - LIMIT_TOLERANCE
+    high = q > np.asarray(robot.upper) + LIMIT_TOLERANCE
+    return np.asarray((low | high) & ~np.asarray(robot.continuous, dtype=bool))
+
+
+@runtime_checkable
+class JointState(Protocol):
+    """Joint values by name, such as a ROS message of that type."""
+
+    name: Any
+    position: Any
+
+
+Named = Mapping[str, Any] | JointState
+
+
 def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
     """Return joint values as a fresh float64 array, C-contiguous and writeable.
 
@@ -351,6 +382,14 @@ def joint_values(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values.copy(order="C")
+    if isinstance(values, JointState):
+        values = dict(zip(values.name, values.position, strict=True))
+    if isinstance(values, Mapping):
+        missing = [name for name in robot.joint_names if name not in values]
+        if missing:
+            named = f"the joints {missing}; it names {sorted(map(str, values))}"
+            raise RobotError(f"{what} has no value for {named}")
+        values = [values[name] for name in robot.joint_names]
     try:
         array = np.asarray(values)
         if array.dtype.kind == "c":

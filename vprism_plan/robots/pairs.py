@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from numpy.random import Generator
 
 from vprism_plan._arguments import whole
-from vprism_plan._shapes import Configurations, Indices, Pairs, Values
+from vprism_plan._shapes import Configurations, Pairs, Values
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import KinematicArrays, frame_poses, only_links, place
 from vprism_plan.robots.sphere_files import ChosenSpheres
@@ -151,6 +150,11 @@ def _named(pairs: Pairs, names: Sequence[str], reason: str) -> Reasons:
     return {frozenset((names[a], names[b])): reason for a, b in pairs}
 
 
+def pair_room(arrays: KinematicArrays, pairs: Pairs) -> Values:
+    """Metres by which the gap of each pair exceeds that of its spheres."""
+    return np.asarray((arrays.link_padding - arrays.link_buffer)[pairs].sum(axis=1))
+
+
 def pair_gaps(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.ndarray:
     """Distance between the spheres of two links in each configuration, padding not counted.
 
@@ -161,13 +165,14 @@ def pair_gaps(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.nd
     balls = place(poses, arrays.link_frame, arrays.link_center)
     gaps = np.linalg.norm(balls[:, pairs[:, 0]] - balls[:, pairs[:, 1]], axis=2)
     gaps -= arrays.link_radius[pairs].sum(axis=1)
-    gaps += arrays.link_padding[pairs].sum(axis=1)
+    room = pair_room(arrays, pairs)
+    gaps += room
     for k in np.flatnonzero((gaps <= ROOM).any(axis=0)):
         near = np.flatnonzero(gaps[:, k] <= ROOM)
         a, b = (slice(arrays.link_start[i], arrays.link_start[i + 1]) for i in pairs[k])
         apart = np.linalg.norm(spheres[near, a][:, :, None] - spheres[near, b][:, None], axis=3)
         apart -= arrays.sphere_radius[a, None] + arrays.sphere_radius[b]
-        gaps[near, k] = apart.min(axis=(1, 2)) + arrays.link_padding[pairs[k]].sum()
+        gaps[near, k] = apart.min(axis=(1, 2)) + room[k]
     return gaps
 
 
@@ -178,7 +183,7 @@ def _least_gaps(
     span, least = arrays.upper - arrays.lower, np.full(len(pairs), np.inf)
     both = np.array([[0, 1]])
     for k, pair in enumerate(pairs):
-        small = _of_links(arrays, pair)
+        small = only_links(arrays, pair)
         # Every start carries the same steps at once; the nearest is where the next begin.
         best = starts[k, 0]
         for scale in _SCALES:
@@ -190,30 +195,6 @@ def _least_gaps(
             if least[k] <= ROOM:
                 break
     return least
-
-
-def _of_links(arrays: KinematicArrays, links: Indices) -> KinematicArrays:
-    """Only these links, in this order, and the joints that move them; q stays as it was."""
-    frames: set[int] = {0}
-    for link in links:
-        frame = int(arrays.link_frame[link])
-        while frame > 0:
-            frames.add(frame)
-            frame = int(arrays.parent[frame])
-    kept = np.array(sorted(frames))
-    place_of = np.full(len(arrays.parent), -1)
-    place_of[kept] = np.arange(len(kept))
-    small = only_links(arrays, links)
-    return replace(
-        small,
-        parent=np.where(arrays.parent[kept] >= 0, place_of[arrays.parent[kept]], -1),
-        **{
-            name: getattr(arrays, name)[kept]
-            for name in ("R_off", "t_off", "axis", "kind", "q_index", "q_mult", "q_offset")
-        },
-        sphere_frame=place_of[small.sphere_frame],
-        link_frame=place_of[small.link_frame],
-    )
 
 
 def pairs_touching(arrays: KinematicArrays, q: Configurations, pairs: Pairs) -> np.ndarray:

@@ -151,6 +151,13 @@ def _of_link(robot: Any, name: str) -> tuple[tuple, tuple, np.ndarray]:
 
 def robot_warnings(robot: Any) -> tuple[str, ...]:
     """See :attr:`Robot.warnings`. Samples, no proof: that takes a second (`Robot.report`)."""
+    parts = robot._parts
+    model, file, found = parts.model, parts.chosen.file, [*parts.semantics.warnings]
+    if file.missing:
+        found.append(f"{file.source} names what {model.name} lacks, left out: {file.missing}")
+    still = [joint.name for joint in model.joints if joint.kind in ("floating", "planar")]
+    if still:
+        found.append(f"floating or planar joints stand still, as base_pose says: {still}")
     bare, unread, unchecked = [], [], []
     for name in dict.fromkeys((*robot.geometry_as_read, *robot.meshes_as_read)):
         solids, meshes, rows = _of_link(robot, name)
@@ -163,7 +170,9 @@ def robot_warnings(robot: Any) -> tuple[str, ...]:
             stands_out = float(sphere_gap(points, rows).max(initial=0.0))
             if stands_out > _BARE:
                 bare.append(f"{name} by {1000.0 * stands_out:.0f} mm")
-    found = []
+    for name, link in model.links.items():
+        if link.seen and name not in (*robot.link_spheres, *unchecked):
+            unchecked.append(f"{name} (it has only a <visual>)")
     if bare:
         found.append(
             f"collision spheres do not hold their links: {', '.join(bare)} stand out and are not "

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,13 +24,23 @@ from vprism_plan.robots.changes import Held
 from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
 from vprism_plan.robots.kinematics import Attachment, KinematicArrays, TorchKinematics
 from vprism_plan.robots.report import RobotReport, robot_report, robot_warnings
-from vprism_plan.robots.sphere_files import link_spheres, write_spheres
+from vprism_plan.robots.sphere_files import ChosenSpheres, link_spheres, write_spheres
 from vprism_plan.robots.sphere_fit import SphereFit
 from vprism_plan.robots.srdf import SemanticModel, choose_joints, load_srdf, lock_values, write_srdf
-from vprism_plan.robots.urdf import load_model
+from vprism_plan.robots.urdf import RobotModel, load_model
 
 READY = "ready"
-_logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What a robot is made of, whatever joints are locked."""
+
+    model: RobotModel
+    semantics: SemanticModel
+    chosen: ChosenSpheres
+    stated: dict[frozenset[str], str] | None  # pairs that files disable; None: they do not say
+    matrix_samples: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +56,7 @@ class Robot:
         locked: Value of every other actuated joint.
         velocity_limits: (dof,) rad/s or m/s; inf where the URDF states none.
         base_pose: (4, 4) pose of the root link in the world.
+        acceleration_limits: (dof,) the same per second; inf where no robot file states any.
         link_names: The links that carry collision spheres.
         geometry: Link name -> its primitive solids (links without any are absent).
         named_states: SRDF states that fix every joint of ``joint_names``.
@@ -57,6 +67,9 @@ class Robot:
             "Rigid" for links that no joint moves against each other; "Always" and "Never" of
             random configurations; or what :meth:`attach` says.
         arrays: The flat form that compiled kernels read.
+        links: Every link, and every attached object -> where it sits.
+        tool: The link that reaches poses where none is named; None if no file says.
+        check_locked: Whether links that only locked joints move are checked against the world.
         meshes: Link name -> its collision meshes, read when they are asked for; scaled as
             the robot is, without its padding, by which nothing grows a mesh.
         link_spheres: Link name -> (n, 4) rows (x, y, z, radius) in the link's frame: the
@@ -73,6 +86,7 @@ class Robot:
     joint_names: tuple[str, ...]
     locked: dict[str, float]
     velocity_limits: Float[np.ndarray, "dof"]
+    acceleration_limits: Float[np.ndarray, "dof"]
     base_pose: Pose
     link_names: tuple[str, ...]
     geometry: dict[str, tuple[PrimitiveGeometry, ...]]
@@ -80,7 +94,10 @@ class Robot:
     groups: dict[str, tuple[str, ...]]
     disabled_pairs: dict[frozenset[str], str]
     arrays: KinematicArrays
-    _links: dict[str, Attachment] = field(repr=False)
+    links: dict[str, Attachment] = field(repr=False)
+    _parts: _Parts = field(repr=False)
+    tool: str | None = None
+    check_locked: bool = False
     meshes: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     link_spheres: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     sphere_sources: dict[str, str] = field(default_factory=dict, repr=False)
@@ -90,8 +107,8 @@ class Robot:
     meshes_as_read: dict[str, tuple[MeshFile, ...]] = field(default_factory=dict, repr=False)
     # Pairs disabled by random configurations -> whether the values of locked joints enter.
     _sampled_pairs: dict[frozenset[str], bool] = field(default_factory=dict, repr=False)
-    # Link -> metres that the file of its spheres wants it to grow by; in `arrays` already.
-    _file_padding: dict[str, float] = field(default_factory=dict, repr=False)
+    # The calls that changed it since it was made of its parts: name and arguments.
+    _changes: tuple[tuple[str, dict[str, Any]], ...] = field(default=(), repr=False)
     attached: dict[str, str] = field(default_factory=dict)
     held: dict[str, Held] = field(default_factory=dict, repr=False)
 
@@ -116,6 +133,7 @@ class Robot:
         package_dirs: PackageDirs = None,
         fit: SphereFit | None = None,
         matrix_samples: int = pairs.SAMPLES,
+        check_locked: bool = False,
     ) -> Robot:
         """Read a robot.
 
@@ -126,21 +144,27 @@ class Robot:
                 each other, links whose spheres always overlap, and links that stay far apart,
                 both judged by ``matrix_samples`` random configurations.
             spheres: Collision spheres: a YAML file (``collision_spheres: {link:
-                [{center: [x, y, z], radius: r}]}``), a robot file of cuRobo, an XRDF file,
-                such content as a mapping, or None: ``<stem>_spheres.yml`` beside the URDF,
-                else spheres that enclose the URDF's own geometry (spheres are taken as
-                they are). "fit" does so in any case.
-            base_pose: (4, 4) pose of the root link in the world; None is identity.
-            joints: Joints of a configuration, in the order wanted. None takes the SRDF group
-                "arm" if there is one, else all joints that move and do not mimic another.
-            locked: Values for joints not in ``joints``. Default for each: its value in the
-                SRDF (state "ready" first, then file order), else 0 or the limit next to it.
+                [{center: [x, y, z], radius: r}]}``), a robot file of cuRobo, an XRDF file
+                (see :func:`read_spheres` for what else is read of them), such content as a
+                mapping, or None: ``<stem>_spheres.yml`` beside the URDF, else spheres that
+                enclose the URDF's own geometry (spheres are taken as they are). "fit" does
+                so in any case.
+            base_pose: (4, 4) pose of the root link in the world, whatever floating or planar
+                joint holds it there; None is identity.
+            joints: Joints of a configuration, in the order wanted. None takes the joints of
+                cuRobo's or XRDF's ``cspace``, else the SRDF group "arm" if there is one, else
+                all that move (lower < upper) and do not mimic another.
+            locked: Values for joints not in ``joints``. Default for each: that of cuRobo's or
+                XRDF's file, else its value in the SRDF (state "ready" first, then file
+                order), else 0 or the limit next to it.
             group: Instead of ``joints``: an SRDF group, whose joints are taken.
             package_dirs: Where ``package://NAME/...`` leads to: folders that hold packages,
                 or a mapping from a name to its folder. ROS_PACKAGE_PATH, AMENT_PREFIX_PATH
                 and the folders above the URDF are searched in any case.
             fit: How spheres are fitted; None: as :class:`SphereFit` has it.
             matrix_samples: For the pairs that are generated.
+            check_locked: Whether links that only locked joints move, as a second arm's, are
+                checked against the world like those that move; else they are not, as the base.
 
         Raises:
             RobotError: Something above is malformed or does not fit together.
@@ -151,18 +175,47 @@ class Robot:
         if srdf is None and beside.is_file():
             srdf = beside
         semantics = SemanticModel() if srdf is None else load_srdf(srdf, model)
-        active = choose_joints(model, semantics, joints, group)
-        fixed_values = lock_values(model, semantics, active, locked or {})
         base = rigid_pose(
             "base_pose", np.eye(4) if base_pose is None else base_pose, error=RobotError
         )
         chosen = link_spheres(model, path, spheres, fit or SphereFit())
-        arrays, links = kinematics.build_arrays(model, active, fixed_values, chosen.rows, base)
-        stated = None if srdf is None else semantics.disabled
-        tested, disabled, sampled = pairs.choose_pairs(
-            model, arrays, chosen, stated, matrix_samples
+        file = chosen.file
+        if joints is None and group is None:
+            joints = file.joints or None
+        active = choose_joints(model, semantics, joints, group)
+        known = {n: v for n, v in (file.rest | file.locked).items() if n not in active}
+        known |= dict(locked or {})
+        stated = None
+        if srdf is not None or file.ignored is not None:
+            stated = dict.fromkeys(file.ignored or (), "Ignored") | semantics.disabled
+        parts = _Parts(model, semantics, chosen, stated, matrix_samples)
+        return cls._of(parts, active, known, base, check_locked)
+
+    @classmethod
+    def _of(
+        cls,
+        parts: _Parts,
+        active: tuple[str, ...],
+        locked: Mapping[str, float],
+        base: Pose,
+        check_locked: bool,
+    ) -> Robot:
+        model, semantics, chosen = parts.model, parts.semantics, parts.chosen
+        file = chosen.file
+        fixed_values = lock_values(model, semantics, active, locked)
+        arrays, links = kinematics.build_arrays(
+            model, active, fixed_values, chosen.rows, base, file.buffer
         )
-        arrays = dataclasses.replace(arrays, pairs=tested)
+        tested, disabled, sampled = pairs.choose_pairs(
+            model, arrays, chosen, parts.stated, parts.matrix_samples
+        )
+        checked = [check_locked and name in model.moved for name in chosen.rows]
+        arrays = dataclasses.replace(
+            arrays, pairs=tested, link_fixed=arrays.link_fixed & ~np.array(checked)
+        )
+        states = semantics.full_states(active)
+        if file.rest.keys() >= set(active):
+            states.setdefault(READY, np.array([file.rest[name] for name in active]))
         solids = {n: link.primitives for n, link in model.links.items() if link.primitives}
         meshes = {n: link.meshes for n, link in model.links.items() if link.meshes}
         robot = cls(
@@ -170,33 +223,31 @@ class Robot:
             joint_names=active,
             locked=fixed_values,
             velocity_limits=np.array([model.joint_map[j].velocity for j in active]),
+            acceleration_limits=np.array([file.accelerations.get(j, math.inf) for j in active]),
             base_pose=base,
             link_names=tuple(chosen.rows),
             geometry=solids,
-            named_states=semantics.full_states(active),
+            named_states=states,
             groups=semantics.group_links,
             disabled_pairs=disabled,
             arrays=arrays,
-            _links=links,
+            links=links,
+            tool=file.tool,
+            check_locked=check_locked,
             meshes=meshes,
             link_spheres=chosen.rows,
             sphere_sources=chosen.sources,
             geometry_as_read=solids,
             meshes_as_read=meshes,
             _sampled_pairs={p: pairs.hangs_on(model, fixed_values, p) for p in sampled},
-            _file_padding=chosen.padding,
+            _parts=parts,
         )
-        return robot.with_padding(chosen.padding) if chosen.padding else robot
+        return changes.padded(robot, file.padding, 1.0) if file.padding else robot
 
     @property
     def dof(self) -> int:
         """Number of joints in a configuration."""
         return len(self.joint_names)
-
-    @property
-    def links_with_meshes(self) -> tuple[str, ...]:
-        """Links with collision meshes: what ``geometry`` holds of them is not the whole link."""
-        return tuple(self.meshes_as_read)
 
     @property
     def lower(self) -> Float[np.ndarray, "dof"]:
@@ -230,7 +281,8 @@ class Robot:
 
     @property
     def fixed_links(self) -> Bool[np.ndarray, "links"]:
-        """True for links of ``link_names`` that no joint moves (the mounted base)."""
+        """True for links of ``link_names`` that are not checked against the world: no joint moves
+        them (the mounted base)."""
         return self.arrays.link_fixed
 
     @property
@@ -262,7 +314,7 @@ class Robot:
         members = tuple(link for link in self.groups.get(name, ()) if link in self.link_names)
         if members:
             return members
-        known = name in self.groups or name in self._links
+        known = name in self.groups or name in self.links
         what = "has no collision spheres, so it is" if known else "is"
         raise RobotError(
             f"{name!r} {what} no link or group of {self.name} to check; "
@@ -307,7 +359,7 @@ class Robot:
         """
         R, t = kinematics.frame_poses(self.arrays, self.check_configuration(q)[None])
         poses = {}
-        for link, sits in self._links.items():
+        for link, sits in self.links.items():
             frame = np.eye(4)
             frame[:3, :3], frame[:3, 3] = R[0, sits.frame], t[0, sits.frame]
             poses[link] = frame @ sits.T
@@ -348,8 +400,44 @@ class Robot:
 
     @functools.cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What is usable but odd: links that stand out of their spheres, or that nothing checks."""
+        """What is usable but odd: in the files, links that stand out of their spheres, or that
+        nothing checks."""
         return robot_warnings(self)
+
+    def values(self, joints: kinematics.Named) -> Float[np.ndarray, "dof"]:
+        """A configuration from joint values by name, which do wherever a configuration is taken.
+
+        Joints that are not in ``joint_names`` are passed over. RobotError if one is missing, or
+        no finite number.
+        """
+        return self.check_configuration(joints)
+
+    def with_locked(self, values: Mapping[str, float], check_locked: bool | None = None) -> Robot:
+        """The same robot with joints held at other values, those of a configuration left out.
+
+        Pairs that are not tested are found anew; padding and attached objects stay.
+
+        Args:
+            values: Joint -> radians or metres; joints that are locked already take the new value.
+            check_locked: As in :meth:`from_urdf`; None: as it is.
+
+        Raises:
+            RobotError: An unknown joint, a value outside its limits, or none is left to move.
+        """
+        check = self.check_locked if check_locked is None else check_locked
+        rest = tuple(name for name in self.joint_names if name not in values)
+        if not rest:
+            raise RobotError(f"all joints {list(self.joint_names)} are locked; leave one to move")
+        locked = self.locked | dict(values)
+        robot = Robot._of(self._parts, rest, locked, self.base_pose, check)
+        for name, given in self._changes:
+            robot = getattr(robot, name)(**given)
+        return robot
+
+    def _after(self, change: str, make: Callable[..., Any], **given: Any) -> Robot:
+        """What a change makes of this robot, with a note of it."""
+        changes = (*self._changes, (change, given))
+        return dataclasses.replace(make(self, **given), _changes=changes)
 
     def with_base_pose(self, base_pose: ArrayLike) -> Robot:
         """The same robot with its root link at another (4, 4) pose in the world.
@@ -388,7 +476,7 @@ class Robot:
         Raises:
             RobotError: An unknown link or group, or a value that is not allowed for it.
         """
-        return changes.padded(self, padding, scale)
+        return self._after("with_padding", changes.padded, padding=padding, scale=scale)
 
     def attach(
         self,
@@ -422,7 +510,10 @@ class Robot:
         Raises:
             RobotError: The name is taken, a link is unknown, or the shape is unusable.
         """
-        return changes.attached(self, name, link, spheres, mesh, pose, touch_links, max_spheres)
+        return self._after(
+            "attach", changes.attached, name=name, link=link, spheres=spheres, mesh=mesh, pose=pose,
+            touch_links=touch_links, max_spheres=max_spheres,
+        )  # fmt: skip
 
     def detach(self, name: str) -> Robot:
         """The same robot without an attached object.
@@ -430,7 +521,7 @@ class Robot:
         Raises:
             RobotError: Nothing of that name is attached, or something is attached to it.
         """
-        return changes.detached(self, name)
+        return self._after("detach", changes.detached, name=name)
 
     def report(self) -> RobotReport:
         """Compare the spheres with the geometry of the URDF, and list what is not tested.
@@ -456,14 +547,15 @@ class Robot:
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML, to be read bit by bit as ``<stem>_spheres.yml``.
 
-        The buffer of a file of cuRobo or XRDF is written as ``padding``, apart from the radii;
+        Buffers of a file of cuRobo or XRDF are written as padding, apart from the radii;
         that of :meth:`with_padding` is not written.
         """
-        bare = {name: np.empty((0, 4)) for name in (*self.geometry, *self.links_with_meshes)}
+        bare = {name: np.empty((0, 4)) for name in (*self.geometry, *self.meshes)}
         note = f"Collision spheres of {self.name}, metres, in link frames."
-        if self._file_padding:
+        file = self._parts.chosen.file
+        if file.padding or file.buffer:
             note += "\nRadii are without the padding at the end, which is added when this is read."
-        write_spheres(path, bare | self.link_spheres, note, self._file_padding)
+        write_spheres(path, bare | self.link_spheres, note, file.padding, file.buffer)
 
     def write_srdf(self, path: str | Path) -> None:
         """Write an SRDF: the configuration's joints as group "arm", other groups, named

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""Collision spheres of links: of a file (this package's YAML, cuRobo's, XRDF), else fitted."""
+"""Robot files (this package's YAML, cuRobo's, XRDF), and collision spheres: theirs, or fitted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ class ChosenSpheres:
 
     rows: LinkSpheres  # never empty
     sources: dict[str, str]  # "file", "urdf" (of its own), "tiled" (over its solids) or "fitted"
-    padding: dict[str, float] = field(default_factory=dict)  # metres that a file adds to them
+    file: SphereTable  # what else it says
 
 
 def link_spheres(
@@ -78,10 +78,6 @@ def link_spheres(
             "geometry and would go unchecked; add spheres, or an empty list to leave a link out "
             "on purpose"
         )
-    emptied = [name for name, rows in known.items() if not len(rows) and name in solid]
-    if emptied and table.foreign:
-        odd = "%s leaves the links %s without spheres; they have geometry that is not checked"
-        _logger.warning(odd, table.source, emptied)
     rest = _from_geometry(model, bare, fit)
     if rest.rows:
         _logger.info("%s leaves out %s; their spheres are fitted", table.source, list(rest.rows))
@@ -89,7 +85,7 @@ def link_spheres(
     held = {name: everything[name] for name in model.links if len(everything.get(name, ()))}
     if not held:
         raise RobotError(f"{table.source} gives no link a sphere; a robot needs at least one")
-    return ChosenSpheres(held, {name: sources[name] for name in held}, table.padding)
+    return ChosenSpheres(held, {name: sources[name] for name in held}, table.only(model))
 
 
 def _from_geometry(model: RobotModel, links: Iterable[str], fit: SphereFit) -> ChosenSpheres:
@@ -114,7 +110,7 @@ def _from_geometry(model: RobotModel, links: Iterable[str], fit: SphereFit) -> C
             sources[name] = "urdf"
         if parts:
             rows[name] = np.vstack(parts)
-    return ChosenSpheres(rows, sources)
+    return ChosenSpheres(rows, sources, SphereTable("", rows))
 
 
 # -------------------------------------------------------------------------------------- files
@@ -126,6 +122,29 @@ class SphereTable:
     spheres: LinkSpheres  # those that are switched off left out; a link may have none
     padding: dict[str, float] = field(default_factory=dict)  # metres against the world
     foreign: bool = False  # another program's, which may name links that the robot lacks
+    buffer: dict[str, float] = field(default_factory=dict)  # metres against other links
+    ignored: frozenset[frozenset[str]] | None = None  # pairs of links; None: it does not say
+    joints: tuple[str, ...] = ()  # of a configuration; empty: it does not say
+    locked: dict[str, float] = field(default_factory=dict)  # the value of other joints
+    rest: dict[str, float] = field(default_factory=dict)  # a configuration, by joint
+    accelerations: dict[str, float] = field(default_factory=dict)  # limits, by joint
+    tool: str | None = None  # the link that reaches poses
+    missing: tuple[str, ...] = ()  # what it names of this, and the robot does not have
+
+    def only(self, model: RobotModel) -> SphereTable:
+        """The same of what a robot has; the names of the rest are `missing`."""
+        joints, links, pairs = model.joint_map, model.links, self.ignored or ()
+        missing = {*self.joints, *self.locked, *self.rest} - joints.keys()
+        missing |= frozenset({self.tool or model.root}).union(*pairs) - links.keys()
+        return replace(
+            self,
+            ignored=self.ignored and frozenset(pair for pair in pairs if pair <= set(links)),
+            joints=tuple(name for name in self.joints if name in model.movable),
+            locked={name: v for name, v in self.locked.items() if name in model.actuated},
+            rest={name: v for name, v in self.rest.items() if name in model.actuated},
+            tool=self.tool if self.tool in links else None,
+            missing=tuple(sorted(missing)),
+        )
 
 
 def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
@@ -134,12 +153,17 @@ def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
     Understood are
 
     - ``collision_spheres: {link: [{center: [x, y, z], radius: r}, ...]}``, or the inner
-      mapping by itself, which ``write_spheres`` writes; beside it, ``padding: {link: metres}``;
+      mapping by itself, which ``write_spheres`` writes; beside it, ``padding: {link: metres}``
+      against the world and ``self_padding`` against other links;
     - cuRobo's robot files, with ``robot_cfg: kinematics: collision_spheres`` as the name of
       a file beside it or inline, and its files of spheres alone (with a key ``robot``).
-      A radius of 0 or below switches a sphere off; ``collision_sphere_buffer`` is padding;
+      A radius of 0 or below switches a sphere off; ``collision_sphere_buffer`` is padding,
+      ``self_collision_buffer`` self-padding. Also read are ``self_collision_ignore``,
+      ``lock_joints``, ``ee_link``, and of ``cspace`` the joints, their order, the retracted
+      configuration and the acceleration limits;
     - XRDF: the spheres of the geometry that ``collision`` names, radii of 0 or below off;
-      its ``buffer_distance`` is padding.
+      ``buffer_distance`` is padding, in ``self_collision`` self-padding. Also read are
+      ``ignore``, ``cspace``, ``default_joint_positions`` and the first of ``tool_frames``.
 
     Padding below 0 would shrink links and is not applied.
 
@@ -149,11 +173,11 @@ def read_spheres(spheres: str | Path | Mapping[str, Any]) -> SphereTable:
     Raises:
         RobotError: There is no such file, it is none of the above, or a sphere is malformed.
     """
-    if not isinstance(spheres, str | Path):
-        return _understood(spheres, "spheres", Path())
-    path = Path(spheres)
+    given = not isinstance(spheres, str | Path)
+    path = Path("spheres" if given else str(spheres))
     with reading(path, "a usable file of spheres", RobotError):
-        return _understood(_yaml(path), f"'{path}'", path.parent)
+        content, source = (spheres, "spheres") if given else (_yaml(path), f"'{path}'")
+        return _understood(content, source, path.parent)
 
 
 def _understood(content: Any, source: str, folder: Path) -> SphereTable:
@@ -168,14 +192,14 @@ def _understood(content: Any, source: str, folder: Path) -> SphereTable:
         return _from_curobo(kinematics, source, folder)
     alone = isinstance(content, Mapping) and "robot" in content
     spheres_of = _table(content, source, off=alone)
-    padding: dict[str, float] = {}
-    if "collision_spheres" in content and not alone:
-        own = content.get("padding")
-        unknown = sorted(set(own) - set(spheres_of)) if isinstance(own, Mapping) else []
+    named = "collision_spheres" in content and not alone
+    own = [content.get(key) if named else None for key in ("padding", "self_padding")]
+    for table in own:
+        unknown = sorted(set(table) - set(spheres_of)) if isinstance(table, Mapping) else []
         if unknown:
             raise RobotError(f"{source} pads the links {unknown}, to which it gives no spheres")
-        padding = _padding(own, spheres_of, source)
-    return SphereTable(source, spheres_of, padding, foreign=alone)
+    padding, buffer = (_padding(table, spheres_of, source) for table in own)
+    return SphereTable(source, spheres_of, padding, foreign=alone, buffer=buffer)
 
 
 def _yaml(path: Path) -> Any:
@@ -245,8 +269,22 @@ def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:
             )
         entry, named = _yaml(path), f"'{path}'"
     spheres = _table(entry, named, off=True)
-    buffer = kinematics.get("collision_sphere_buffer")
-    return SphereTable(source, spheres, _padding(buffer, spheres, source), foreign=True)
+    cspace, of_joint = kinematics.get("cspace") or {}, f"{source} gives joint"
+    joints, tool = cspace.get("joint_names") or (), kinematics.get("ee_link")
+    locked = finite_values(kinematics.get("lock_joints"), (), of_joint)
+    return SphereTable(
+        source,
+        spheres,
+        _padding(kinematics.get("collision_sphere_buffer"), spheres, source),
+        foreign=True,
+        buffer=_padding(kinematics.get("self_collision_buffer"), spheres, source),
+        ignored=_pairs(kinematics.get("self_collision_ignore")),
+        joints=tuple(name for name in joints if name not in locked),
+        locked=locked,
+        rest=finite_values(cspace.get("retract_config"), joints, of_joint),
+        accelerations=finite_values(cspace.get("max_acceleration"), joints, of_joint),
+        tool=tool and str(tool),
+    )
 
 
 def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
@@ -263,24 +301,49 @@ def _from_xrdf(content: Mapping[str, Any], source: str) -> SphereTable:
         found = f"the section 'collision' names the geometry {name!r}, which has no spheres"
         raise RobotError(f"{source}: {found}; geometries: {sorted(map(str, geometries))}")
     spheres = _table(chosen["spheres"], source, off=True)
-    padding = _padding(section.get("buffer_distance"), spheres, source)
-    return SphereTable(source, spheres, padding, foreign=True)
+    cspace, own = content.get("cspace") or {}, content.get("self_collision") or {}
+    joints, tools = cspace.get("joint_names") or (), content.get("tool_frames") or ()
+    of_joint = f"{source} gives joint"
+    return SphereTable(
+        source,
+        spheres,
+        _padding(section.get("buffer_distance"), spheres, source),
+        foreign=True,
+        buffer=_padding(own.get("buffer_distance"), spheres, source),
+        ignored=_pairs(own.get("ignore")),
+        joints=tuple(joints),
+        rest=finite_values(content.get("default_joint_positions"), (), of_joint),
+        accelerations=finite_values(cspace.get("acceleration_limits"), joints, of_joint),
+        tool=str(tools[0]) if tools else None,
+    )
+
+
+def _pairs(entry: Mapping[str, Sequence[str]] | None) -> frozenset[frozenset[str]] | None:
+    """Pairs of a mapping: link -> links."""
+    if entry is None:
+        return None
+    return frozenset(frozenset((a, b)) for a, others in entry.items() for b in others if a != b)
+
+
+def finite_values(entry: Any, names: Sequence[str], what: str) -> dict[str, float]:
+    """Value of each joint or link; from a table, one number for all, or one each."""
+    if entry is not None and not isinstance(entry, Mapping):
+        several = entry if isinstance(entry, list | tuple) else [entry] * len(names)
+        entry = dict(zip(names, several, strict=True))
+    values = {}
+    for name, value in (entry or {}).items():
+        try:
+            values[str(name)] = float(value)
+        except (TypeError, ValueError):
+            values[str(name)] = math.nan
+        if not math.isfinite(values[str(name)]):
+            raise RobotError(f"{what} '{name}' the value {value!r}; give one finite number")
+    return values
 
 
 def _padding(buffer: Any, spheres: LinkSpheres, source: str) -> dict[str, float]:
-    table = buffer if isinstance(buffer, Mapping) else dict.fromkeys(spheres, buffer or 0.0)
-    padding = {}
-    for link, value in table.items():
-        try:
-            grown = float(value)
-        except (TypeError, ValueError):
-            grown = math.nan
-        if not math.isfinite(grown):
-            found = f"the buffer of link '{link}' is {value!r}"
-            raise RobotError(f"{source}: {found}; it must be metres")
-        if grown > 0.0 and len(spheres.get(link, ())):
-            padding[str(link)] = grown
-    return padding
+    grown = finite_values(buffer, tuple(spheres), f"{source} gives the buffer of link")
+    return {link: pad for link, pad in grown.items() if pad > 0.0 and len(spheres.get(link, ()))}
 
 
 def _table(content: Any, source: str, off: bool) -> LinkSpheres:
@@ -315,6 +378,7 @@ def write_spheres(
     spheres: Mapping[str, Spheres],
     note: str = "",
     padding: Mapping[str, float] | None = None,
+    self_padding: Mapping[str, float] | None = None,
 ) -> None:
     """Write spheres as YAML that :func:`read_spheres` reads back bit by bit.
 
@@ -323,28 +387,17 @@ def write_spheres(
         spheres: Link -> (n, 4) rows (x, y, z, radius), link frame, metres.
         note: Lines for a comment at the top.
         padding: Link -> metres that spheres grow by against the world, not in their radii.
+        self_padding: The same against other links.
     """
-    lines = [f"# {line}".rstrip() for line in note.splitlines()]
-    lines.append("collision_spheres:")
-    for link, rows in spheres.items():
-        lines.append(f"  {_key(link)}:" + ("" if len(rows) else " []"))
-        for row in rows:
-            x, y, z, radius = (_number(float(value)) for value in row)
-            lines.append(f"    - {{center: [{x}, {y}, {z}], radius: {radius}}}")
-    if padding:
-        lines.append("padding:")
-        lines += [f"  {_key(link)}: {_number(float(value))}" for link, value in padding.items()]
-    write_text(path, "\n".join(lines) + "\n")
+    import yaml
 
-
-def _number(value: float) -> str:
-    """Shortest text that gives the same number, with the dot that YAML 1.1 asks for."""
-    text = repr(value)
-    mantissa, mark, exponent = text.partition("e")
-    return text if "." in mantissa else f"{mantissa}.0{mark}{exponent}"
-
-
-def _key(link: str) -> str:
-    """A link's name as a YAML key; quoted where it could be read as something else."""
-    plain = link.isidentifier() and link.lower() not in {"y", "n", "yes", "no", "on", "off"}
-    return link if plain and link.lower() not in {"true", "false", "null"} else f'"{link}"'
+    content: dict[str, Any] = {
+        "collision_spheres": {
+            link: [{"center": row[:3], "radius": row[3]} for row in np.asarray(rows).tolist()]
+            for link, rows in spheres.items()
+        }
+    }
+    tables = {"padding": padding, "self_padding": self_padding}
+    content |= {name: {k: float(v) for k, v in t.items()} for name, t in tables.items() if t}
+    lines = [f"# {line}".rstrip() + "\n" for line in note.splitlines()]
+    write_text(path, "".join(lines) + yaml.safe_dump(content, sort_keys=False, width=100))

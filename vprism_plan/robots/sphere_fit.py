@@ -15,20 +15,27 @@ must lie in one sphere. Three steps, all without chance:
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from vprism_plan._arguments import number, whole
+from vprism_plan._files import cache_folder, replacing
 from vprism_plan._shapes import Indices, Points, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
+from vprism_plan.robots import surfaces
 from vprism_plan.robots.geometry import PrimitiveGeometry
 from vprism_plan.robots.surfaces import Surface, with_hull
 
+_logger = logging.getLogger(__name__)
 _MOST, _ARM_SIZED = 12, 0.35
 _CENTRES, _MORE_CENTRES = 400, 1000
 _CLOSE = 0.015  # of an object's diagonal, that spheres may stand out by without more of them
@@ -120,7 +127,24 @@ def hold_object(triangles: Triangles, max_spheres: int = 32) -> Spheres:
 # The wheels, fingers and arms of a robot are often alike.
 @lru_cache(maxsize=256)
 def _fit(corners: bytes, tolerance: float, max_spheres: int) -> Spheres:
-    return _fitted(with_hull(np.frombuffer(corners).reshape(-1, 3, 3)), tolerance, max_spheres)
+    """Of a file of the cache, whose name is a digest of all that the spheres hang on, else made."""
+    program = b"".join(Path(file).read_bytes() for file in (__file__, surfaces.__file__))
+    libraries = [version(name) for name in ("numpy", "scipy", "trimesh")]
+    key = hashlib.sha256(program + f"{libraries} {tolerance!r} {max_spheres} ".encode() + corners)
+    folder = cache_folder("spheres")
+    file = None if folder is None else folder / key.hexdigest()
+    content = file.read_bytes() if file is not None and file.is_file() else b""
+    if hashlib.sha256(content[32:]).digest() == content[:32]:
+        return np.frombuffer(content[32:]).reshape(-1, 4)
+    surface = with_hull(np.frombuffer(corners).reshape(-1, 3, 3))
+    rows = np.ascontiguousarray(_fitted(surface, tolerance, max_spheres))
+    if file is not None:
+        try:
+            with replacing(file) as temporary:
+                temporary.write_bytes(hashlib.sha256(rows.tobytes()).digest() + rows.tobytes())
+        except OSError as error:
+            _logger.warning("fitted spheres are not kept: %s", error)
+    return rows
 
 
 def _fitted(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import logging
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ import numpy as np
 from vprism_plan._files import reading, write_text
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
-from vprism_plan.robots.urdf import RobotModel
+from vprism_plan.robots.sphere_files import finite_values
+from vprism_plan.robots.urdf import LIMIT_TOLERANCE, RobotModel
 
 Names = dict[str, tuple[str, ...]]
 RIGID = "Rigid"  # why a pair is not tested, where no joint moves its links
@@ -32,6 +33,7 @@ class SemanticModel:
     # (state, group) -> joint -> value
     states: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
     disabled: dict[frozenset[str], str] = field(default_factory=dict)  # pair -> reason
+    warnings: tuple[str, ...] = ()
 
     def state_value(self, joint: str) -> float | None:
         """The joint's value in the first state that names it ("ready" before others)."""
@@ -51,94 +53,115 @@ class SemanticModel:
 
 
 def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
-    """Read an SRDF and check every name in it against the URDF.
+    """Read an SRDF as MoveIt does: what the robot does not have is left out, with a warning.
+
+    So a disabled pair with a typing error disables nothing, and stays tested.
 
     Raises:
-        RobotError: The file is missing or malformed, or names links or joints the robot does
-            not have: a disabled pair with a typing error would disable nothing.
+        RobotError: The file is missing or malformed.
     """
     path = Path(path)
     if not path.is_file():
         raise RobotError(f"no SRDF file at '{path}'; give an existing file, or leave srdf=None")
     with reading(path, "a usable SRDF", RobotError, MOST_BYTES):
         root = robot_element(path, "an SRDF")
-        groups, links = _groups(root, model, path)
-        states, disabled = _states(root, model, path), _disabled(root, model, path)
-        return SemanticModel(groups, links, states, disabled)
+        missing: Missing = set()
+        groups, links = _groups(root, model, missing, path)
+        states, disabled = _states(root, model, missing, path), _disabled(root, model, missing)
+        # A virtual joint ties the base to the world; it is no joint of the URDF.
+        missing -= {("joint", element.get("name", "")) for element in root.findall("virtual_joint")}
+        named = ", ".join(sorted(f"{what} '{name}'" for what, name in missing))
+        odd = f"'{path}' names what {model.name} does not have, left out: {named}"
+        return SemanticModel(groups, links, states, disabled, (odd,) if missing else ())
 
 
-def _groups(root: ET.Element, model: RobotModel, path: Path) -> tuple[Names, Names]:
+Missing = set[tuple[str, str]]  # "joint", "link" or "group", and a name in vain
+
+
+def _has(what: str, name: str, valid: Collection[str], missing: Missing) -> bool:
+    """Whether there is something of that name; what there is not is noted."""
+    if name not in valid:
+        missing.add((what, name))
+    return name in valid
+
+
+def _groups(
+    root: ET.Element, model: RobotModel, missing: Missing, path: Path
+) -> tuple[Names, Names]:
     """The joints and the links of every group: as in MoveIt, what its joints move directly."""
-    groups: Names = {}
-    links: Names = {}
     parent_of = {joint.child: joint for joint in model.joints}
-    # A virtual joint ties the base to the world; it is no joint of the URDF.
-    virtual = {element.get("name", "") for element in root.findall("virtual_joint")}
-    for group in root.findall("group"):
-        joints, named = list[str](), list[str]()
-        for member in group:
-            name = member.get("name", "")
-            if member.tag == "joint" and name not in virtual:
-                joints.append(_known(name, model.joint_map, "joint", path))
-                named.append(model.joint_map[name].child)
-            elif member.tag == "link":
-                named.append(_known(name, model.links, "link", path))
-                if name in parent_of:
-                    joints.append(parent_of[name].name)
-            elif member.tag == "group":
-                joints += groups[_known(name, groups, "group", path)]
-                named += links[name]
-            elif member.tag == "chain":
-                base = _known(member.get("base_link", ""), model.links, "link", path)
-                tip = link = _known(member.get("tip_link", ""), model.links, "link", path)
-                chain: list[str] = []
-                while link != base:
-                    if link not in parent_of:
-                        where = f"group '{group.get('name')}' in '{path}'"
-                        raise RobotError(f"{where}: '{base}' is not above '{tip}'")
-                    chain.insert(0, link)
-                    link = parent_of[link].parent
-                joints += [parent_of[link].name for link in chain]
-                named += chain
-        groups[group.get("name", "")] = tuple(dict.fromkeys(joints))
-        links[group.get("name", "")] = tuple(dict.fromkeys(named))
-    return groups, links
+
+    def chain(group: str, base: str, tip: str) -> list[str]:
+        if not all(_has("link", end, model.links, missing) for end in (base, tip)):
+            return []
+        links: list[str] = []
+        link = tip
+        while link != base:
+            if link not in parent_of:
+                raise RobotError(f"group '{group}' in '{path}': '{base}' is not above '{tip}'")
+            links.insert(0, link)
+            link = parent_of[link].parent
+        return links
+
+    elements = {element.get("name", ""): element for element in root.findall("group")}
+    tables: dict[str, Any] = {"joint": model.joint_map, "link": model.links, "group": elements}
+    groups: Names = {}
+    group_links: Names = {}
+    begun: list[str] = []
+
+    def read(group: str) -> None:
+        if group in groups:
+            return
+        if group in begun:
+            raise RobotError(f"group '{group}' in '{path}' is in itself, through {begun}")
+        begun.append(group)
+        joints, links = list[str](), list[str]()
+        for member in elements[group]:
+            name, kind = member.get("name", ""), member.tag
+            if kind == "chain":
+                below = chain(group, member.get("base_link", ""), member.get("tip_link", ""))
+                joints += [parent_of[link].name for link in below]
+                links += below
+            elif kind not in tables or not _has(kind, name, tables[kind], missing):
+                continue
+            elif kind == "group":
+                read(name)
+                joints += groups[name]
+                links += group_links[name]
+            elif kind == "joint":
+                joints.append(name)
+                links.append(model.joint_map[name].child)
+            else:
+                links.append(name)
+                joints += [parent_of[name].name] if name in parent_of else []
+        groups[group] = tuple(dict.fromkeys(joints))
+        group_links[group] = tuple(dict.fromkeys(links))
+
+    for name in elements:
+        read(name)
+    return groups, group_links
 
 
 def _states(
-    root: ET.Element, model: RobotModel, path: Path
+    root: ET.Element, model: RobotModel, missing: Missing, path: Path
 ) -> dict[tuple[str, str], dict[str, float]]:
     states: dict[tuple[str, str], dict[str, float]] = {}
     for state in root.findall("group_state"):
-        values: dict[str, float] = {}
-        for joint in state.findall("joint"):
-            name = _known(joint.get("name", ""), model.joint_map, "joint", path)
-            try:
-                values[name] = float(joint.get("value", ""))
-            except ValueError:
-                values[name] = math.nan
-            if not math.isfinite(values[name]):
-                where = f"state '{state.get('name')}' in '{path}'"
-                found = f"gives joint '{name}' the value {joint.get('value')!r}"
-                raise RobotError(f"{where} {found}; give one finite number")
-        states[state.get("name", ""), state.get("group", "")] = values
+        values = {joint.get("name", ""): joint.get("value", "") for joint in state.findall("joint")}
+        values = {n: v for n, v in values.items() if _has("joint", n, model.joint_map, missing)}
+        values = {n: v for n, v in values.items() if model.joint_map[n].moves}
+        found = f"state '{state.get('name')}' in '{path}' gives joint"
+        states[state.get("name", ""), state.get("group", "")] = finite_values(values, (), found)
     return states
 
 
-def _disabled(root: ET.Element, model: RobotModel, path: Path) -> dict[frozenset[str], str]:
+def _disabled(root: ET.Element, model: RobotModel, missing: Missing) -> dict[frozenset[str], str]:
     pairs: dict[frozenset[str], str] = {}
     for element in root.findall("disable_collisions"):
-        ends = (element.get(key, "") for key in ("link1", "link2"))
-        pair = frozenset(_known(end, model.links, "link", path) for end in ends)
-        pairs[pair] = element.get("reason", "")
+        ends = {element.get(key, "") for key in ("link1", "link2")}
+        if len([end for end in ends if _has("link", end, model.links, missing)]) == len(ends):
+            pairs[frozenset(ends)] = element.get("reason", "")
     return pairs
-
-
-def _known(name: str, valid: Mapping[str, Any], what: str, path: Path) -> str:
-    if name not in valid:
-        found = f"'{path}' names the {what} '{name}', which the robot does not have"
-        raise RobotError(f"{found}; valid: {sorted(valid)}")
-    return name
 
 
 def choose_joints(
@@ -148,7 +171,7 @@ def choose_joints(
     group: str | None = None,
 ) -> tuple[str, ...]:
     """The joints of a configuration: given, of the group, of the group "arm", or else all."""
-    valid = model.actuated
+    valid = model.movable
     if group is not None:
         if joints is not None:
             raise RobotError(f"both joints and the group {group!r} are given; give one of them")
@@ -185,12 +208,14 @@ def lock_values(
     for name in rest:
         joint = model.joint_map[name]
         value = float(given[name]) if name in given else semantics.state_value(name)
-        if value is None:
-            value = min(max(0.0, joint.lower), joint.upper)
-        within = joint.kind == "continuous" or joint.lower <= value <= joint.upper
-        if not (math.isfinite(value) and within):
-            limits = f"[{joint.lower:.6g}, {joint.upper:.6g}]"
-            raise RobotError(f"joint '{name}' is locked at {value}; its limits are {limits}")
+        nearest = min(max(0.0 if value is None else value, joint.lower), joint.upper)
+        if value is None or joint.kind != "continuous" or not math.isfinite(value):
+            excess = 0.0 if value is None else abs(value - nearest)
+            if not excess <= LIMIT_TOLERANCE:
+                limits = f"[{joint.lower:.6g}, {joint.upper:.6g}]"
+                said = f"its limits are {limits}, which it leaves by {excess:.3g}"
+                raise RobotError(f"joint '{name}' is locked at {value}; {said}")
+            value = nearest
         values[name] = value
     return values
 

@@ -7,6 +7,7 @@ import functools
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from vprism_plan.robots.geometry import MeshFile, PackageDirs, PrimitiveGeometry
 from vprism_plan.robots.plain_xml import MOST_BYTES, robot_element
 
 MOVING_TYPES = ("revolute", "continuous", "prismatic")
+# Radians or metres beyond a limit that count as on it: encoders and copies in single precision.
+LIMIT_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ class Link:
     name: str
     primitives: tuple[PrimitiveGeometry, ...] = ()
     meshes: tuple[MeshFile, ...] = ()
+    seen: bool = False  # it has a <visual>
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,21 @@ class RobotModel:
         """Names of the joints that move and do not mimic another."""
         return tuple(j.name for j in self.joints if j.moves and j.mimic is None)
 
+    @property
+    def movable(self) -> tuple[str, ...]:
+        """Those of them with any room between their limits; the others are locked."""
+        joints = self.joint_map
+        return tuple(n for n in self.actuated if joints[n].lower < joints[n].upper)
+
+    @functools.cached_property
+    def moved(self) -> frozenset[str]:
+        """Names of the links with a joint that moves, locked or not, between them and the root."""
+        found: set[str] = set()
+        for joint in self.joints:
+            if joint.moves or joint.parent in found:
+                found.add(joint.child)
+        return frozenset(found)
+
     def resolve_mimic(self, name: str) -> tuple[str, float, float]:
         """Follow mimic joints to (driver, multiplier, offset): multiplier * driver + offset."""
         multiplier, offset = 1.0, 0.0
@@ -85,9 +104,15 @@ class RobotModel:
 _FARTHEST_LIMIT = 1e4  # radians or metres; SDF writes 1e16 for "none"
 _SMALLEST, _LARGEST = 1e-6, 1e3  # metres of a solid, which is cut into tiles
 _MOST_LINKS = 1000  # tables of a robot grow with the square of its links; PR2 has 90
-_ALL_TYPES = (*MOVING_TYPES, "fixed", "floating", "planar")
+_TO_THE_WORLD = ("floating", "planar")
+_ALL_TYPES = (*MOVING_TYPES, "fixed", *_TO_THE_WORLD)
 # Of each solid, the attributes of its size, and how many numbers these hold.
-_SIZES = {"box": (("size",), 3), "cylinder": (("radius", "length"), 2), "sphere": (("radius",), 1)}
+_SIZES = {
+    "box": (("size",), 3),
+    "cylinder": (("radius", "length"), 2),
+    "capsule": (("radius", "length"), 2),
+    "sphere": (("radius",), 1),
+}
 
 
 def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel:
@@ -95,7 +120,8 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
 
     Raises:
         RobotError: The file is missing or malformed, or describes something that is not a tree
-            of links joined by revolute, continuous, prismatic and fixed joints.
+            of links joined by revolute, continuous, prismatic and fixed joints (floating and
+            planar ones may join the root to the world).
     """
     path = Path(path)
     if not path.is_file():
@@ -109,10 +135,19 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
             raise RobotError(f"'{path}' has {len(links):,} links; at most {_MOST_LINKS:,} are read")
         return build_tree(
             root.get("name", path.stem),
-            [_link(element, path, package_dirs) for element in links],
-            [_joint(element, path) for element in root.findall("joint")],
+            [_named(_link, element, path, package_dirs) for element in links],
+            [_named(_joint, element, path) for element in root.findall("joint")],
             path,
         )
+
+
+def _named(read: Callable[..., Any], element: ET.Element, path: Path, *others: Any) -> Any:
+    """Read a link or a joint; what is wrong in it is said with its name."""
+    try:
+        return read(element, path, *others)
+    except (KeyError, ValueError, TypeError) as error:
+        what = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise RobotError(f"{element.tag} '{element.get('name')}' in '{path}': {what}") from error
 
 
 def _name(element: ET.Element, path: Path) -> str:
@@ -162,14 +197,14 @@ def _link(element: ET.Element, path: Path, package_dirs: PackageDirs) -> Link:
         if shape is None:
             raise RobotError(f"{whose} has a <collision> without a shape")
         if shape.tag != "mesh":
-            primitives.append(_primitive(shape, T, whose))
+            primitives += _primitives(shape, T, whose)
             continue
         filename = shape.get("filename")
         if not filename:
             raise RobotError(f"{whose} has a <mesh> without a filename; name a file")
         found, searched = find_mesh(filename, path, package_dirs)
         meshes.append(MeshFile(name, filename, _scale(shape, whose), T, found, tuple(searched)))
-    return Link(name, tuple(primitives), tuple(meshes))
+    return Link(name, tuple(primitives), tuple(meshes), element.find("visual") is not None)
 
 
 def _scale(mesh: ET.Element, whose: str) -> np.ndarray:
@@ -181,16 +216,24 @@ def _scale(mesh: ET.Element, whose: str) -> np.ndarray:
     return scale
 
 
-def _primitive(shape: ET.Element, T: np.ndarray, whose: str) -> PrimitiveGeometry:
+def _primitives(shape: ET.Element, T: np.ndarray, whose: str) -> list[PrimitiveGeometry]:
+    """A shape as solids: a capsule is a cylinder, of its length, between two spheres."""
     kind: Any = shape.tag
     if kind not in _SIZES:
-        raise RobotError(f"{whose} has a collision shape of Unknown tag: {kind}")
+        raise RobotError(f"{whose} has a collision shape <{kind}>; read are {[*_SIZES, 'mesh']}")
     keys, expected = _SIZES[kind]
     size = tuple(_numbers(" ".join(shape.attrib[key] for key in keys)))
     if len(size) != expected or not all(_SMALLEST <= v <= _LARGEST for v in size):
         valid = f"sizes must be positive and finite, from {_SMALLEST:g} to {_LARGEST:g} m"
         raise RobotError(f"{whose} has a {kind} of size {size}; {valid}")
-    return PrimitiveGeometry(kind, size, T)
+    if kind != "capsule":
+        return [PrimitiveGeometry(kind, size, T)]
+    ends = []
+    for side in (-0.5, 0.5):
+        at = T.copy()
+        at[:3, 3] += side * size[1] * T[:3, 2]
+        ends.append(PrimitiveGeometry("sphere", size[:1], at))
+    return [PrimitiveGeometry("cylinder", size, T), *ends]
 
 
 def _joint(element: ET.Element, path: Path) -> Joint:
@@ -204,20 +247,15 @@ def _joint(element: ET.Element, path: Path) -> Joint:
             raise RobotError(f"{whose} names no {part} link")
     if kind not in _ALL_TYPES:
         raise RobotError(f"{whose} has type {kind!r}; valid: {_ALL_TYPES}")
-    if kind in ("floating", "planar"):
-        raise RobotError(
-            f"joint '{name}' is {kind}; supported are revolute, continuous, prismatic and "
-            "fixed. Replace it by a fixed joint and place the robot with base_pose"
-        )
     T = _origin(element, whose)
     mimic, copied = None, element.find("mimic")
-    if copied is not None and kind != "fixed":
+    if copied is not None and kind in MOVING_TYPES:
         factors = float(copied.get("multiplier", 1.0)), float(copied.get("offset", 0.0))
         mimic = (copied.get("joint", ""), *factors)
         if not all(map(math.isfinite, factors)):
             raise RobotError(f"{whose} has a non-finite mimic factor: {mimic}")
     lower, upper, velocity = _limits(element, whose, kind)
-    axis = _axis(element, whose, kind) if kind != "fixed" else np.array([1.0, 0.0, 0.0])
+    axis = _axis(element, whose, kind) if kind in MOVING_TYPES else np.array([1.0, 0.0, 0.0])
     return Joint(name, kind, ends["parent"], ends["child"], T, axis, lower, upper, velocity, mimic)
 
 
@@ -243,9 +281,11 @@ def _limits(joint: ET.Element, whose: str, kind: str) -> tuple[float, float, flo
         raise RobotError(f"{whose} has velocity limit {velocity}; it must be positive")
     if kind == "continuous":
         return -math.pi, math.pi, velocity
-    if kind == "fixed":
+    if kind not in MOVING_TYPES:
         return 0.0, 0.0, velocity
     lower, upper = _number(limit, "lower"), _number(limit, "upper")
+    if lower is None and upper is None and joint.find("mimic") is not None:
+        return -math.inf, math.inf, velocity  # the joint that it follows has some
     if lower is None or upper is None:
         remedy = "state both, or make it continuous"
         raise RobotError(f"{kind} {whose} has no lower and upper <limit>; {remedy}")
@@ -304,6 +344,10 @@ def build_tree(name: str, links: list[Link], joints: list[Joint], path: Path) ->
         lost = sorted({joint.name for joint in joints} - {joint.name for joint in ordered})
         raise RobotError(f"joints {lost} in '{path}' form a cycle; a URDF is a tree")
     model = RobotModel(name, roots[0], link_map, tuple(ordered))
+    hanging = [j.name for j in ordered if j.kind in _TO_THE_WORLD and j.parent in model.moved]
+    if hanging:
+        wanted = "only what stands still may be joined to the world so: make them fixed"
+        raise RobotError(f"joints {hanging} in '{path}' are floating or planar; {wanted}")
     _check_mimics(model, path)
     narrowed = _narrowed(model, path)
     return replace(model, joints=tuple(narrowed.get(joint.name, joint) for joint in ordered))

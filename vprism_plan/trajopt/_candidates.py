@@ -19,6 +19,7 @@ from vprism_plan.planning import CheckerLike
 from vprism_plan.planning.ompl_adapter import nearest_turns
 from vprism_plan.planning.path import interpolated, one_line, verified
 from vprism_plan.planning.result import PlanReport, PlanResult
+from vprism_plan.robots.kinematics import within_limits
 from vprism_plan.trajopt._minimize import Limits, Minimum, adam, lbfgs
 
 _log = logging.getLogger(__name__)
@@ -45,11 +46,6 @@ class Seeds:
     names: list[str]
     q: Float[np.ndarray, "s t dof"]
     given: list[np.ndarray]
-
-
-def _within_limits(robot: Any, q: Float[np.ndarray, "*n dof"]) -> Float[np.ndarray, "*n dof"]:
-    turns = np.asarray(robot.continuous, dtype=bool)
-    return np.clip(q, np.where(turns, -np.inf, robot.lower), np.where(turns, np.inf, robot.upper))
 
 
 def smooth_basis(inner: int, order: int) -> Float[np.ndarray, "n n"]:
@@ -131,7 +127,7 @@ def _detour(
     a, b = straight[0], straight[-1]
     width = _SPREAD * (1.0 + number) * (np.asarray(robot.upper) - np.asarray(robot.lower))
     draws = 0.5 * (a + b) + width * rng.standard_normal((_DRAWS, len(a)))
-    draws = _within_limits(robot, draws)
+    draws = within_limits(robot, draws)
     best, rank = draws[0], (-1, -np.inf)
     for q in draws:
         if checker.is_valid(q):
@@ -148,7 +144,7 @@ def _noisy(robot: Any, base: np.ndarray, number: int, rng: np.random.Generator) 
     drawn = basis @ rng.standard_normal((len(basis), base.shape[1]))
     q = base.copy()
     width = np.asarray(robot.upper) - np.asarray(robot.lower)
-    q[1:-1] = _within_limits(robot, q[1:-1] + _NOISE * (1.0 + number) * width * drawn)
+    q[1:-1] = within_limits(robot, q[1:-1] + _NOISE * (1.0 + number) * width * drawn)
     return q
 
 
@@ -332,7 +328,7 @@ class Candidates:
         with torch.no_grad():
             q = self.objective.trajectories(minimum.x, torch.arange(len(z))).numpy()
         inside = q.copy()
-        inside[:, 1:-1] = _within_limits(self.checker.robot, q[:, 1:-1])
+        inside[:, 1:-1] = within_limits(self.checker.robot, q[:, 1:-1])
         clipped = np.flatnonzero((inside != q).any(axis=(1, 2)))
         if len(clipped):  # what is handed out costs something else than what was minimised
             rows = torch.from_numpy(clipped)

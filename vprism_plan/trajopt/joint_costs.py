@@ -162,9 +162,9 @@ class PoseCost(TrajectoryCost):
         self.position_weight = number("position_weight", position_weight, 0.0)
         self.rotation_weight = number("rotation_weight", rotation_weight, 0.0)
         self._wanted = rigid_pose("pose", pose)
-        if link not in robot._links:
-            raise RobotError(f"no link {link!r} in {robot.name}; links: {sorted(robot._links)}")
-        sits = robot._links[link]
+        if link not in robot.links:
+            raise RobotError(f"no link {link!r} in {robot.name}; links: {sorted(robot.links)}")
+        sits = robot.links[link]
         # Its origin and the ends of its axes move with the link's frame, as spheres do.
         ends = np.vstack([np.zeros(3), np.eye(3)]) @ sits.T[:3, :3].T + sits.T[:3, 3]
         self._points = TorchKinematics(

@@ -13,6 +13,7 @@ from vprism_plan._arguments import choice, number
 from vprism_plan._kernels import trajopt as kernels
 from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import ConfigError
+from vprism_plan.robots.pairs import pair_room
 from vprism_plan.trajopt._field import grown, union_field
 from vprism_plan.trajopt.cost import (
     SHORT,
@@ -300,11 +301,11 @@ class SelfCollisionCost(SphereCost):
         self._kept = kept
         arrays = robot.arrays
         rows, reach = [np.empty((0, 2), np.int64)], [np.empty(0)]
-        for a, b in arrays.pairs:
+        for (a, b), room in zip(arrays.pairs, pair_room(arrays, arrays.pairs), strict=True):
             spheres = [np.arange(arrays.link_start[k], arrays.link_start[k + 1]) for k in (a, b)]
             rows.append(np.stack(np.meshgrid(*spheres, indexing="ij"), axis=-1).reshape(-1, 2))
             both = arrays.sphere_radius[rows[-1]].sum(axis=1) + kept
-            reach.append(both - arrays.link_padding[a] - arrays.link_padding[b])
+            reach.append(both - room)
         self._pairs, self._reach = np.concatenate(rows), np.concatenate(reach)
 
     def _kernel(self, grad: np.ndarray, *samples: np.ndarray) -> float:

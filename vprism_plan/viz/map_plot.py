@@ -131,15 +131,9 @@ def map_figure(
     return figure
 
 
-def object_points(m: "VPrismMap") -> np.ndarray:
-    """Return the observed points (n, 3) of all objects, metres."""
-    seen = [view.points() for view in m.views]
-    return np.concatenate([points[labels > 0] for points, labels in seen])
-
-
 def _slices(m: "VPrismMap", resolution: float) -> tuple[Slice, Slice]:
     """Both slices share their first axis, the direction in which the camera looks."""
-    objects = object_points(m)
+    objects = m.shown()
     low, high = np.percentile(objects, [0.5, 99.5], axis=0)
     middle = 0.5 * (low + high)
     normal, top = m.plane.normal, float(high[2])

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vprism_plan.viz._figures import hatched, legend, line, name_axes, new_figure, object_color
-from vprism_plan.viz.map_plot import Slice, draw_slice, hatch, object_points
+from vprism_plan.viz.map_plot import Slice, draw_slice, hatch
 from vprism_plan.viz.plan_plot import GOAL_COLOR, HAND_COLOR, START_COLOR, hand_path
 from vprism_plan.world.sources import object_id, source_of
 
@@ -103,7 +103,7 @@ def _height(checker: "CollisionChecker", path: np.ndarray) -> float:
 
 
 def _horizontal(m: Any, height: float, resolution: float) -> Slice:
-    low, high = np.percentile(object_points(m)[:, :2], [0.5, 99.5], axis=0)
+    low, high = np.percentile(m.shown()[:, :2], [0.5, 99.5], axis=0)
     x, y = (np.arange(a, b, resolution) for a, b in zip(low - _PAD, high + _PAD, strict=True))
     title = f"{100 * (height - float(m.plane.offset / m.plane.normal[2])):.1f} cm above the table"
     u, v, up = np.eye(3)

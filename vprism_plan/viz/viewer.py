@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vprism_plan.errors import ConfigError, MissingDependencyError
+from vprism_plan.errors import ConfigError, MapError, MissingDependencyError
 from vprism_plan.viz._figures import object_color
 from vprism_plan.viz.plan_plot import hand_path
 from vprism_plan.viz.robot_plot import link_meshes
@@ -122,7 +122,10 @@ class Viewer:
         Raises:
             MissingDependencyError: viser is not installed.
             ConfigError: a trajectory without a robot, or of another one.
+            MapError: the map has no objects.
         """
+        if not m.object_ids:
+            raise MapError("the map has no objects: there are no surfaces and no entropy to show")
         if trajectory is not None:
             joints = trajectory.positions.shape[1]
             if robot is None or robot.dof != joints:

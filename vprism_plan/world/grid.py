@@ -84,15 +84,22 @@ def is_level(plane: Plane | None) -> bool:
     return plane is not None and float(plane.normal[2]) > 0.99
 
 
-def _default_box(map_: Any, bounded: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Box of the observed objects and robot, grown by the room an arm moves in around them."""
+def _default_box(
+    map_: Any, bounded: bool, known: list[tuple[Vector, Vector]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Box of the observed objects and robot, grown by the room an arm moves in around them; of
+    the middle half of an empty table; of known geometry (its boxes) where nothing was observed."""
     seen = []
     for view in map_.views:
         points, labels = view.points()
-        seen.append(points[(labels > 0) | view.sees_robot[view.depth > 0]])
+        chosen = (labels > 0) | view.sees_robot[view.depth > 0]
+        seen.append(points[chosen])
     points = np.concatenate(seen) if seen else np.empty((0, 3))
+    if len(points) == 0 and not map_.object_ids:
+        points = map_.shown()
     if len(points) == 0:
-        points = np.stack(map_.support_bounds())
+        boxes = [] if map_.object_ids else known
+        points = np.concatenate(boxes or [map_.support_bounds()])
     lower, upper = points.min(axis=0) - _REACH, points.max(axis=0) + _REACH
     if is_level(map_.plane):
         lower[2] = min(lower[2], map_.plane.offset) if bounded else map_.plane.offset - _UNDER
@@ -119,10 +126,11 @@ def choose_grid(map_: Any, config: WorldConfig, level_box: tuple[Vector, Vector]
         WorldError: the grid would have too many nodes to be of use.
     """
     bounded = config.support == "seen"
-    boxes = [_default_box(map_, bounded) if config.bounds is None else np.array(config.bounds)]
+    known = [item.box() for item in config.known if not isinstance(item, HalfSpace)]
+    wanted: Any = config.bounds
+    boxes = [_default_box(map_, bounded, known) if wanted is None else np.array(wanted), *known]
     if level_box is not None:
         boxes.append(level_box)
-    boxes += [item.box() for item in config.known if not isinstance(item, HalfSpace)]
     lower = np.min([box[0] for box in boxes], axis=0)
     upper = np.max([box[1] for box in boxes], axis=0)
     # Marked cells reach up to one step beyond what they cover.

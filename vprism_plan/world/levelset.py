@@ -142,6 +142,8 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         WorldError: the map says "occupied" where it has no evidence at all, or the cells would fill
             the memory.
     """
+    if not map_.object_ids:
+        return LevelSet(spacing, (), 0)
     detail = _detail(map_)
     prior = getattr(map_, "prior", None)
     if map_.unsupported_occupancy >= level:

@@ -31,6 +31,7 @@ from vprism_plan.world.sources import LAST_MARK, MARKED
 from vprism_plan.world.unseen_objects import OpenSides, UnseenObjects, open_sides
 
 CELLS = 2  # cells per grid step for everything that is seen or not seen
+_FINEST, _MESH_CELLS = 16, 8_000_000  # cells per grid step of a known mesh, and of all of it
 _CHUNK = 1 << 17  # cells whose logits are in memory at once
 
 
@@ -241,16 +242,20 @@ def only(marks: Lattice, label: int) -> Lattice:
     return Lattice(own.view(np.uint8), marks.corner, marks.factor)
 
 
-def rasterize_mesh(known: KnownMesh, grid: Grid, factor: int) -> Lattice:
-    """Mark every cell a mesh touches, and its inside if it is watertight.
+def rasterize_mesh(known: KnownMesh, grid: Grid) -> Lattice:
+    """Mark every cell a mesh touches, and its inside if it is watertight; cells are as small as a
+    few million of them allow, at least a sixteenth and at most half of a grid step.
 
     The surface is divided until its edges are no longer than a cell; every point of a triangle is
     then within edge / sqrt(3) of a corner, and the cells within that are marked.
     """
     import trimesh
 
-    spacing = grid.spacing / factor
     lower, upper = known.box()
+    factor = _FINEST
+    while factor > CELLS and np.prod((upper - lower) / grid.spacing * factor + 5) > _MESH_CELLS:
+        factor //= 2
+    spacing = grid.spacing / factor
     corner = np.floor(lower / spacing).astype(np.int64) - 2
     last = np.ceil(upper / spacing).astype(np.int64) + 2
     labels = lattice_nodes(last - corner + 1, f"known mesh {known.name!r}")

@@ -3,9 +3,10 @@
 
 import logging
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,9 @@ from jaxtyping import Float, UInt8
 
 from vprism_plan._threads import beside
 from vprism_plan.errors import WorldError
+from vprism_plan.mapping.posterior import nothing
 from vprism_plan.world import visibility
-from vprism_plan.world.config import HalfSpace, KnownMesh, OccludedPolicy, WorldConfig
+from vprism_plan.world.config import HalfSpace, Known, KnownMesh, OccludedPolicy, WorldConfig
 from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
@@ -34,7 +36,7 @@ from vprism_plan.world.levelset import (
     rasterize_level_set,
     trace_level_set,
 )
-from vprism_plan.world.marks import CELLS, Evidence, only, rasterize_mesh, unmark
+from vprism_plan.world.marks import Evidence, only, rasterize_mesh, unmark
 from vprism_plan.world.posterior_worlds import PosteriorWorlds, classes_of
 from vprism_plan.world.seen import RIM, seen_support
 from vprism_plan.world.sources import LAST_MARK, MARKED, SUPPORT, object_id
@@ -60,10 +62,15 @@ class World:
     the policies say.
 
     Args:
-        map: a `VPrismMap`.
+        map: a `VPrismMap`; None where there is none and no camera: then nothing but known geometry
+            is an obstacle, and all other space is free (`unobserved="occupied"`: all that lies
+            outside of the grid is an obstacle, and all in it).
         config: resolution, level, policies and known geometry.
+        known: more known geometry, beside that of the configuration; an empty list says that there
+            is none.
 
     Attributes:
+        map: that map; one without objects and views where none was given.
         grid: nodes of the field.
         field: distance to objects, background, occluded or unobserved space (by policy) and known
             geometry.
@@ -74,14 +81,25 @@ class World:
         timings: seconds per step of the bake; some steps run at the same time.
 
     Raises:
-        WorldError: the map says "occupied" without evidence, or the grid is too large.
+        WorldError: the map says "occupied" without evidence, the grid is too large, or there is
+            neither a map nor known geometry.
     """
 
     def __init__(
-        self, map: Any, config: WorldConfig | None = None, _traced: LevelSet | None = None
+        self,
+        map: Any = None,
+        config: WorldConfig | None = None,
+        known: Iterable[Known] | None = None,
+        _traced: LevelSet | None = None,
     ) -> None:
-        self.map = map
-        self.config = WorldConfig() if config is None else config
+        config = WorldConfig() if config is None else config
+        if map is None and known is None and not config.known:
+            raise WorldError(
+                "a World is made of a map (fit_map) or of known=[Box(...), ...]; known=[] says "
+                "that there is no obstacle at all"
+            )
+        self.map = map = nothing() if map is None else map
+        self.config = replace(config, known=(*config.known, *known)) if known else config
         self.timings: dict[str, float] = {}
         self._evidence = Evidence(map, self.config)
         self._bounded = self._evidence.bounded
@@ -122,9 +140,9 @@ class World:
         self._unseen: Lattice = self._timed(
             "seen", self._evidence.with_seen, marks, self.grid, self._objects.distance
         )
-        known = self._timed("known geometry", self._known_distances, solids)
-        known += self._solid_distances(self._support, SUPPORT, self.grid)
-        self._known: NodeDistances = combine(known, self.grid)
+        sure = self._timed("known geometry", self._known_distances, solids)
+        sure += self._solid_distances(self._support, SUPPORT, self.grid)
+        self._known: NodeDistances = combine(sure, self.grid)
         self._others = self._timed("distance to the unseen", self._unseen_distances, self._unseen)
         self.field: DistanceField = self._timed(
             "combine", self._field, [self._objects, *self._others, self._known]
@@ -251,7 +269,7 @@ class World:
         for item in solids:
             name = f"known:{item.name}"
             if isinstance(item, KnownMesh):
-                distance, _ = distance_to_lattice(rasterize_mesh(item, self.grid, CELLS), self.grid)
+                distance, _ = distance_to_lattice(rasterize_mesh(item, self.grid), self.grid)
                 parts.append(NodeDistances(distance, self._all_of(name, self.grid)))
             else:
                 parts += self._solid_distances(item, name, self.grid)
@@ -422,6 +440,31 @@ class World:
         entropy = np.asarray(self.map.entropy(flat)).reshape(nx, ny)
         return occupancy, entropy, points
 
+    def export(self, path: Any, frame_id: str = "world") -> Path:
+        """Write what is an obstacle in the box of the grid for another stack; return the path.
+
+        Nothing in that box that is an obstacle is free in the file: cells of `config.resolution`
+        are given whole. Beyond the box a file says nothing, and most readers take that for free:
+        `WorldConfig(bounds=...)` has to hold all that the robot can reach. A bound on risk
+        (`CheckerConfig.max_risk`) is not in it.
+
+        Args:
+            path: its suffix says what is written. `.bt`, `.ot`: OctoMap; P(occupied) of the map,
+                0.97 for other obstacles, unknown where nobody looked (extra `export`). `.scene`,
+                `.yaml`: MoveIt's planning scene as text and as message, one collision object of
+                boxes for each of `sources` and `plane_names`. `.npz`: distance field and
+                occupancy, with their convention. `.obj`, `.glb`, `.stl`, `.ply`: surfaces of the
+                cells. `.usd`, `.usda`, `.usdc`: the same as colliders (extra `export`).
+            frame_id: name of the world frame in formats that have one.
+
+        Raises:
+            ConfigError: another suffix; a mesh of a world without obstacles.
+            MissingDependencyError: the library that owns the format is not installed.
+        """
+        from vprism_plan.world.exports import export_world
+
+        return export_world(self, path, frame_id)
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """What is usable but odd about what this world was made of."""
@@ -439,7 +482,8 @@ class World:
         if lower <= RIM:
             return self
         if self._lowered is None:
-            self._lowered = World(self.map, replace(self.config, support="seen"), self._level_set)
+            lowered = replace(self.config, support="seen")
+            self._lowered = World(self.map, lowered, _traced=self._level_set)
             self._lowered._said = (
                 f"the robot's base stands {lower:.2f} m below the support plane, so the support "
                 f"surface counts only where it was seen and {RIM:g} m around; "

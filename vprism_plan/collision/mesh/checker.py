@@ -112,7 +112,9 @@ class MeshChecker(explain.Checker):
         # Padding is a distance to keep from the world: the solids stay as they are.
         self._padding = placed.robot.arrays.link_padding[placed.links]
         self._need = self.config.margin + self._padding
-        self._apart = placed.radii[self._pairs].sum(axis=1) + self.config.self_margin
+        self._buffer = placed.robot.arrays.link_buffer[placed.links]
+        self._apart = (placed.radii + self._buffer)[self._pairs].sum(axis=1)
+        self._apart += self.config.self_margin
         # Pairs of solid and body that are never looked at: allowed, or of a fixed link.
         self._ignored = allowed[placed.links][:, self.surfaces.classes] | ~placed.moving[:, None]
         self._points = SeenPoints(world, placed, allowed) if seen else None
@@ -413,9 +415,13 @@ class MeshChecker(explain.Checker):
         near = points[np.linalg.norm(points - self.placed.centers[i], axis=1) <= solid.radius]
         return any(solid.holds(point) for point in self.placed.to_link(i, near))
 
+    def _kept(self, i: int, j: int) -> float:
+        """Metres that two solids of the robot must be apart."""
+        return float(self.config.self_margin + self._buffer[i] + self._buffer[j])
+
     def _collide(self, i: int, j: int) -> bool:
         """Whether two solids of the robot come too near to each other."""
-        if _within(self.placed.shape(i), self.placed.shape(j), self.config.self_margin):
+        if _within(self.placed.shape(i), self.placed.shape(j), self._kept(i, j)):
             return True
         witnesses = self.placed.witnesses
         return self._holds(i, witnesses[j : j + 1]) or self._holds(j, witnesses[i : i + 1])
@@ -428,8 +434,9 @@ class MeshChecker(explain.Checker):
             yield int(i), UNSEEN[int(code)], point
 
     def _link_gap(self, i: int, j: int) -> float:
-        """Distance between two solids of the robot; 0 where a mesh is touched."""
-        return fcl.signed_gap(self.placed.shape(i), self.placed.shape(j))
+        """Distance between two solids of the robot, less their buffers; 0 of meshes that touch."""
+        gap = fcl.signed_gap(self.placed.shape(i), self.placed.shape(j))
+        return float(gap - self._buffer[i] - self._buffer[j])
 
     def _gap(self, i: int, b: int, owner: int) -> float:
         """Distance of solid i to body b, padding aside; `owner` as of `_owners`."""
@@ -527,10 +534,10 @@ class MeshChecker(explain.Checker):
             a, b = self.placed.shape(j), self.placed.shape(i)
             touch: explain.Touch | None = fcl.deepest_touch(a, b)
             if touch is None:
-                near = fcl.gap(a, b) <= self.config.self_margin
+                near = fcl.gap(a, b) <= self._kept(i, j)
                 touch = _apart(a, b) if near else (0.0, self.placed.witnesses[i], explain.UP)
             other = self.robot.link_names[self.solids[j].link]
-            yield self._contact(i, other, touch, self.config.self_margin)
+            yield self._contact(i, other, touch, self._kept(i, j))
 
     def _contact(
         self, i: int, body: str, touch: explain.Touch, required: float, detail: str = ""

@@ -81,7 +81,7 @@ def robot_solids(
     if meshes and links == "spheres":
         raise ConfigError("link_meshes are given but links is 'spheres'; use links='geometry'")
     in_link = _spheres_in_links(robot)
-    unread = set(robot.links_with_meshes)
+    unread = set(robot.meshes_as_read)
     solids: list[Solid] = []
     for index, name in enumerate(robot.link_names):
         if links == "geometry" and name in meshes:
