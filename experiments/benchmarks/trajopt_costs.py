@@ -54,12 +54,12 @@ def kinematics(robot: vp.Robot, q: torch.Tensor) -> Callable[[], None]:
     """Forward and backward of pytorch-kinematics alone."""
     rows = q.detach().reshape(-1, q.shape[-1])
     robot.sphere_centers(rows)
-    chain = robot._torch._chains[q.dtype, q.device]
-    joints = rows[:, chain._q_index].clone().requires_grad_()
+    chain, q_index, *_ = robot._torch._chains[q.dtype, q.device]
+    joints = rows[:, q_index].clone().requires_grad_()
 
     def run() -> None:
         joints.grad = None
-        chain._chain.forward_kinematics_tensor(joints, analytical_grad=True).sum().backward()
+        chain.forward_kinematics_tensor(joints, analytical_grad=True).sum().backward()
 
     return run
 
