@@ -4,7 +4,7 @@ Look before you reach
 =====================
 
 Two hand poses behind a box. One view says of neither whether it is free. ``next_view`` says which
-of 64 views would settle it; with that view in the map both are reached, the second beside an object
+of 64 views would settle it; with that view in the map both are reached, the second over an object
 that nobody had seen. ::
 
     python examples/09_look_before_you_reach.py [--picture FILE.png]
@@ -37,7 +37,7 @@ robot = vp.Robot.from_urdf(DATA / "urdf" / "panda.urdf", base_pose=base)
 m = vp.fit_map(first)
 
 # %%
-# Where the hand shall go: straight down, the finger tips 3 cm over the table, 14 and 10 cm behind
+# Where the finger tips shall go, the hand straight down: 14 cm over the table, 14 and 10 cm behind
 # the middle of the box. And where a camera could be: 64 places around the table.
 box, eye = scene.solids[0].center, first.camera_center
 behind = -(eye * [1.0, 1.0, 0.0]) / np.hypot(*eye[:2])
@@ -46,7 +46,7 @@ reaches = {}
 for name, way in (("far", 0.14), ("near", 0.10)):
     hand = np.eye(4)
     hand[:3, :3] = np.column_stack([-behind, aside, [0.0, 0.0, -1.0]])
-    hand[:3, 3] = [*(box + way * behind)[:2], 0.14]  # the tips are 11 cm below
+    hand[:3, 3] = [*(box + way * behind)[:2], 0.14]
     reaches[name] = hand
 cameras = [
     Camera.orbit(np.array([0.0, 0.0, 0.08]), 0.9, azimuth, elevation)
@@ -76,24 +76,25 @@ for name, hand in reaches.items():
         maps[name].append(maps[name][-1].update(seen))
 
 # %%
-# Left: what the first view leaves open at the height of the finger tips, and the candidate views
+# Left: what the first view leaves open, 2 to 20 cm over the table, and the candidate views
 # around it, the better the brighter. Middle: what the best one sees. Right: what is known then.
 look, camera = chosen["far"]
 figure = Figure(figsize=(13.5, 4.6), layout="constrained")
 axes = figure.subplots(1, 3)
-x = y = np.arange(-0.3, 0.3, 0.004)
-level = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), 0.04)], axis=-1).reshape(-1, 3)
-truth = scene.signed_distance(level).reshape(len(y), len(x))
+x = y = np.arange(-0.3, 0.3, 0.005)
+heights = np.arange(0.02, 0.2, 0.03)
+columns = np.stack(np.meshgrid(x, y, heights), axis=-1)
+truth = scene.signed_distance(columns.reshape(-1, 3)).reshape(columns.shape[:3]).min(axis=2)
 for axis, map_, title in (
     (axes[0], maps["far"][0], "one view"), (axes[2], maps["far"][-1], "and the chosen one"),
 ):  # fmt: skip
-    occupied = map_.occupancy(level).reshape(truth.shape)
+    occupied = map_.occupancy(columns.reshape(-1, 3)).reshape(columns.shape[:3]).max(axis=2)
     extent = (x[0], x[-1], y[0], y[-1])
     shown = axis.imshow(occupied, origin="lower", extent=extent, cmap="magma", vmin=0.0, vmax=1.0)
     axis.contour(x, y, truth, [0.0], colors="#ff5fa2", linestyles="--")
     for name, hand in reaches.items():
         axis.plot(*hand[:2, 3], "o" if name == "far" else "X", color="#7fd4ff")
-    axis.set(title=f"P(occupied), {title}", xlabel="x (m)", ylabel="y (m)")
+    axis.set(title=f"largest P(occupied), {title}", xlabel="x (m)", ylabel="y (m)")
 figure.colorbar(shown, ax=axes[2])
 away = 0.33 * views[:, :2, 3]
 worth = np.array([value.utility for value in look.values])

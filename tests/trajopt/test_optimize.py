@@ -251,6 +251,25 @@ def test_start_or_goal_in_a_ball_is_refused_with_the_reason(gap):
         json.dumps(result.to_dict())
 
 
+def test_of_several_goals_the_nearest_that_has_a_path_is_reached(gap):
+    inside, near, far = np.array([0.0, 0.0]), np.array([-0.4, 0.1]), GOAL
+    refused_near = Refusing(gap, lambda qa, qb: np.array_equal(qb, near))
+    for checker, reached in ((gap, near), (refused_near, far)):
+        result = run(checker, START, np.stack([far, inside, near]))
+        assert result.solved, result.message
+        assert np.array_equal(result.path[-1], reached)
+        assert every_edge_is_free(gap, result.path)
+    none = run(gap, START, np.stack([inside, inside + 0.01]))
+    assert none.status == "invalid_goal"
+    assert "all 2 configurations given as goals are invalid" in none.message
+    beside = far - [0.2, 0.0]
+    walled = run(closed_wall(), START, np.stack([far, beside]), repairs=0)
+    assert not walled.solved
+    assert np.array_equal(walled.best[-1], beside)
+    with pytest.raises(PlanningError, match="initial leads to one goal"):
+        run(gap, START, np.stack([far, near]), initial=np.array([START, [0.0, 0.9], GOAL]))
+
+
 def test_results_go_to_json(gap):
     result = run(gap, seeds=3, max_iterations=5)
     loaded = json.loads(json.dumps(result.to_dict()))

@@ -8,6 +8,7 @@ import pytest
 
 import vprism_plan as vp
 from vprism_plan.collision.motion import edges_of
+from vprism_plan.planning import PoseGoalConfig
 from vprism_plan.trajopt import default_cost, optimize
 from vprism_plan.viz import save_figure, trajopt_figure
 
@@ -125,3 +126,17 @@ def test_the_picture_shows_paths_and_history(checker, raw, tmp_path):
     refused = optimize(checker, [9.0, *START[1:]], GOAL)
     with pytest.raises(ValueError, match="start is invalid"):
         trajopt_figure(checker, refused)
+
+
+def test_a_pose_is_reached_by_the_nearest_configuration_that_has_a_path(checker, panda):
+    pose = panda.link_poses(GOAL)["panda_hand"]
+    how = PoseGoalConfig(link="panda_hand", max_goals=2)
+    result = optimize(checker, START, pose, seeds=2, pose_goal=how)
+    assert result.solved, result.message
+    assert free_everywhere(checker, result.path)
+    np.testing.assert_allclose(panda.link_poses(result.path[-1])["panda_hand"], pose, atol=2e-3)
+    away = pose.copy()
+    away[2, 3] = 3.0
+    nothing = optimize(checker, START, away)
+    assert nothing.status == "invalid_goal"
+    assert "reaches the pose" in nothing.message

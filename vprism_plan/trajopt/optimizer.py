@@ -17,7 +17,7 @@ from vprism_plan.collision import CollisionChecker
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
 from vprism_plan.planning.attempts import within_risk
-from vprism_plan.planning.goals import configuration, refuse
+from vprism_plan.planning.goals import PoseGoalConfig, configuration, refuse, valid_goals
 from vprism_plan.planning.result import PlanReport, PlanResult
 from vprism_plan.planning.search import checked_seed
 from vprism_plan.trajopt._candidates import (
@@ -258,7 +258,7 @@ def _default_costs(checker: Any, kept: float | None) -> Callable[[int], Trajecto
 def optimize(
     checker: CheckerLike,
     start: ArrayLike | Sequence[float],
-    goal: ArrayLike | Sequence[float],
+    goal: Any,
     *,
     cost: Any = None,
     seeds: int = 8,
@@ -273,6 +273,7 @@ def optimize(
     repairs: int = 4,
     keep_clearance: bool | np.bool_ | float = False,
     clearance_step: float = 0.05,
+    pose_goal: PoseGoalConfig | None = None,
 ) -> OptimizeResult:
     """Optimise trajectories from `start` to `goal`, and return the best verified one.
 
@@ -286,7 +287,10 @@ def optimize(
 
     Args:
         checker: a `CollisionChecker`, or anything with the members of `CheckerLike`.
-        start, goal: configurations (dof,), radians or metres.
+        start: configuration (dof,), radians or metres.
+        goal: that too; or several, a pose or a region, as for `plan`. Then each configuration
+            is a query of its own, the nearest first, until one has a path; else the answer is
+            that of the nearest.
         cost: what to minimise, a module (..., T, dof) -> (...), differentiable; it is given
             float64 on the CPU. None: `default_cost(checker)`.
         seeds: how many trajectories. The initial paths come first, then the straight line,
@@ -313,6 +317,7 @@ def optimize(
             metres. Kept to 0.5 mm, what it is computed to. It becomes the margin of the
             default cost.
         clearance_step: distance between the samples of the reported clearance.
+        pose_goal: how a pose, or a region, is turned into configurations.
 
     Raises:
         PlanningError: an argument is malformed, naming the value and the valid ones.
@@ -330,29 +335,43 @@ def optimize(
         limit = number("time_limit", time_limit, 0.0, unit="s", above=True, error=PlanningError)
     seed = checked_seed(seed)
     q_start = configuration(start, checker.robot, "start")
-    q_goal = configuration(goal, checker.robot, "goal")
     report = OptimizeReport(method=method, seed=seed)
     numbers = PlanReport(planner="optimize", seed=seed, time_limit=limit)
-    for q, what in ((q_start, "start"), (q_goal, "goal")):
-        refusal = refuse(checker, q, what, numbers)
-        if refusal is not None:
-            return OptimizeResult(
-                path=None,
-                status=refusal.status,  # type: ignore[arg-type]
-                message=refusal.message,
-                report=replace(report, total_time=time.perf_counter() - began),
-                explanation=refusal.explanation,
-            )
-    begun = make_seeds(checker, q_start, q_goal, _paths(initial), seeds, waypoints, seed)
-    kept = _kept(checker, keep_clearance, begun.given, clearance_step)
-    cost, guards = _costs(checker, cost, guard, kept)
-    limits = Limits(max_iterations, tolerance, began + limit)
-    candidates = Candidates(
-        checker, begun, cost=cost, guard=guards, method=method, limits=limits, repairs=repairs,
-        clearance_step=clearance_step, kept=kept,
-    )  # fmt: skip
-    result = within_risk(checker, candidates.attempt, limit)
-    return _answer(result, candidates, report, began)
+    ends = refuse(checker, q_start, "start", numbers) or valid_goals(
+        checker, goal, q_start, pose_goal or PoseGoalConfig(), numbers
+    )
+    if isinstance(ends, PlanResult):
+        return OptimizeResult(
+            path=None,
+            status=ends.status,  # type: ignore[arg-type]
+            message=ends.message,
+            report=replace(report, total_time=time.perf_counter() - began),
+            explanation=ends.explanation,
+        )
+    goals, paths = ends[0], _paths(initial)
+    if len(goals) > 1 and paths:
+        raise PlanningError(f"initial leads to one goal, not to {len(goals)}; give that one")
+    kept: float | None = None
+    answers: list[OptimizeResult] = []
+    for q_goal in goals[np.argsort(np.linalg.norm(goals - q_start, axis=1), kind="stable")]:
+        begun = make_seeds(checker, q_start, q_goal, paths, seeds, waypoints, seed)
+        if not answers:
+            kept = _kept(checker, keep_clearance, begun.given, clearance_step)
+            cost, guards = _costs(checker, cost, guard, kept)
+        limits = Limits(max_iterations, tolerance, began + limit)
+        candidates = Candidates(
+            checker, begun, cost=cost, guard=guards, method=method, limits=limits,
+            repairs=repairs, clearance_step=clearance_step, kept=kept,
+        )  # fmt: skip
+        result = within_risk(
+            checker, candidates.attempt, max(0.0, began + limit - time.perf_counter())
+        )
+        answers.append(_answer(result, candidates, report, began))
+        if answers[-1].solved:
+            return answers[-1]
+        if time.perf_counter() - began >= limit:
+            break
+    return answers[0]
 
 
 def _paths(initial: Any) -> list[Any]:
