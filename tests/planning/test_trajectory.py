@@ -289,7 +289,7 @@ class Picky:
 
     def __getattr__(self, name):
         answer = self._answers.get(name)
-        return getattr(self._checker, name) if answer is None else lambda *_: answer
+        return getattr(self._checker, name) if answer is None else lambda *_, **__: answer
 
 
 def test_who_cannot_judge_a_rounded_corner_is_named(among_balls):
@@ -311,6 +311,35 @@ def test_what_is_refused_is_not_rounded(ball_robot):
         checker.robot, path, checker=Picky(checker, collision_probability=risk)
     )
     assert np.array_equal(risky.positions, stops.positions)
+
+
+def test_a_rounded_motion_is_judged_by_worlds_that_no_corner_has_seen(ball_robot):
+    checker, asked = vp.CollisionChecker(vp.World(known=[]), ball_robot(0.05)), []
+    judge = checker.collision_probability
+
+    def judged(path, held_out=False):
+        asked.append(held_out)
+        return judge(path, held_out)
+
+    checker.collision_probability = judged
+    path = np.array([[0.0, 0, 0], [0.5, 0, 0], [0.5, 0.5, 0]])
+    time_parameterize(checker.robot, path, checker=checker)
+    assert asked == [True]
+
+
+def test_corners_are_rounded_in_a_world_without_a_posterior(ball_robot):
+    """It has no probabilities to bound: asking for one raised ConfigError."""
+    baked = vp.World(known=[Sphere("ball", 0.05, (0.0, 0.4, 0.0))])
+    world = SimpleNamespace(
+        field=baked.field, planes=baked.planes, plane_names=baked.plane_names,
+        sources=baked.sources, config=baked.config, map=baked.map, status=baked.status,
+    )  # fmt: skip
+    checker = vp.CollisionChecker(world, ball_robot(0.02))
+    assert checker.max_risk is None
+    assert checker.config.max_risk is not None
+    path = np.array([[0.0, 0, 0], [0.3, 0, 0], [0.3, -0.3, 0]])
+    rounded = time_parameterize(checker.robot, path, checker=checker)
+    assert rounded.duration < time_parameterize(checker.robot, path).duration
 
 
 def test_an_arm_keeps_its_links_apart_in_rounded_corners(repository):

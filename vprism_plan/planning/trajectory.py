@@ -123,9 +123,11 @@ def time_parameterize(
     if checker is not None and len(lines) > 1:
         corners = np.array([path[0], *(line[-1] for line in lines)])
         rounded = _joined(path[0], [_rounded(corners, scale * speed, scale * push, checker)])
-        most = checker.config.max_risk
         every = np.union1d(np.arange(0.0, rounded.duration, 0.01), rounded.times)
-        if most is None or checker.collision_probability(rounded.sample(every)[0]).upper <= most:
+        most = checker.max_risk
+        # Corners were accepted by the worlds that verdicts have seen; others judge the whole.
+        moved = rounded.sample(every)[0]
+        if most is None or checker.collision_probability(moved, held_out=True).upper <= most:
             return rounded
     return _joined(path[0], (_timed(line, scale * speed, scale * push) for line in lines))
 
