@@ -6,9 +6,6 @@ is raised here always names the offending value, what would be valid, and the
 remedy.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 
 class VPrismError(Exception):
     """Base of everything this package raises on purpose."""
@@ -44,14 +41,3 @@ class PlanningError(VPrismError, ValueError):
 
 class MissingDependencyError(VPrismError, ImportError):
     """An optional dependency is needed; the message names the extra that brings it."""
-
-
-@contextmanager
-def importing(package: str, extra: str) -> Iterator[None]:
-    """Let a block import an optional package; MissingDependencyError says which extra brings it."""
-    try:
-        yield
-    except ImportError as missing:
-        raise MissingDependencyError(
-            f'this needs {package} ({missing}): pip install "vprism_plan[{extra}]"'
-        ) from missing

@@ -21,8 +21,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import is_whole, number
-from vprism_plan._files import read_json, reading, replacing, write_text
-from vprism_plan.errors import PlanningError, importing
+from vprism_plan._files import optional, read_json, reading, replacing, write_text
+from vprism_plan.errors import PlanningError
 from vprism_plan.planning.protocols import Configuration
 
 # Without stated acceleration limits a joint reaches its full speed in this time.
@@ -321,9 +321,8 @@ def write_message(
 
 def _cdr(message: dict[str, Any]) -> bytes:
     """Serialize a message as ROS 2 sends it, little-endian."""
-    with importing("rosbags", "export"):
-        from rosbags.typesys import Stores, get_typestore
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    rosbags = optional("rosbags.typesys", "export", "messages in CDR need")
+    store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
 
     def make(name: str, **values: Any) -> Any:
         return store.types[name](**values)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vprism_plan.errors import ConfigError, MapError, MissingDependencyError
+from vprism_plan._files import optional
+from vprism_plan.errors import ConfigError, MapError
 from vprism_plan.viz._figures import object_color
 from vprism_plan.viz.plan_plot import hand_path
 from vprism_plan.viz.robot_plot import link_meshes
@@ -364,12 +365,7 @@ def require_viser() -> None:
     Raises:
         MissingDependencyError: how to install it.
     """
-    try:
-        import viser  # noqa: F401
-    except ImportError as error:
-        raise MissingDependencyError(
-            "the viewer needs viser, which is not installed: pip install 'vprism_plan[viewer]'"
-        ) from error
+    optional("viser", "viewer", "the viewer needs")
 
 
 def _silence() -> contextlib.redirect_stdout:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int16
 
-from vprism_plan._files import replacing
-from vprism_plan.errors import ConfigError, importing
+from vprism_plan._files import optional, replacing
+from vprism_plan.errors import ConfigError
 from vprism_plan.world.grid import Vector, corners
 from vprism_plan.world.visibility import SEEN
 
@@ -154,8 +154,7 @@ def export_world(world: "World", path: str | Path, frame_id: str = "world") -> P
 
 
 def _write_octomap(world: "World", path: Path, frame_id: str) -> None:
-    with importing("pyoctomap", "export"):
-        import pyoctomap
+    pyoctomap = optional("pyoctomap", "export", "OctoMap files need")
     cells = Cells.of(world)
     occupied = cells.occupied
     tree = pyoctomap.OcTree(cells.spacing)
@@ -255,8 +254,9 @@ def _write_mesh(world: "World", path: Path, frame_id: str) -> None:
 
 
 def _write_usd(world: "World", path: Path, frame_id: str) -> None:
-    with importing("usd-core", "export"):
-        from pxr import Usd, UsdGeom, UsdPhysics, Vt
+    optional("pxr", "export", "USD files need usd-core's")
+    from pxr import Usd, UsdGeom, UsdPhysics, Vt
+
     path.unlink()  # made by `replacing`; USD opens what exists
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
