@@ -227,7 +227,9 @@ class Viewer:
             points, labels = view.points()
             rows = np.flatnonzero(labels > 0)
             rows = rows[:: len(rows) // _POINTS + 1]
-            colors = np.array([_bytes(0.6 * object_color(i)) for i in labels[rows]], np.uint8)
+            colors = np.array(
+                [_bytes(0.6 * object_color(i)) for i in labels[rows].tolist()], np.uint8
+            )
             path, style = f"/points/{number}/seen", {"point_size": 0.002, "visible": number == 0}
             self._add("point_cloud", path, points[rows].astype(np.float32), colors, **style)
             self._box(f"view {number}", number == 0, f"/points/{number}/")
