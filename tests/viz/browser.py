@@ -3,7 +3,8 @@
 
     python tests/viz/browser.py URL FOLDER SCRIPT ...
 
-Each script is asked until its answer is true; once the page has settled, FOLDER/N.png shows it.
+Each script is asked until its answer is true; then FOLDER/N.png shows the page, once its scene has
+become another than in the picture before and has settled.
 Writes JSON: the answers, and what the console called an error. A program of its own: Qt wants the
 main thread, and ends as it likes.
 """
@@ -25,6 +26,7 @@ from PyQt6.QtWidgets import QApplication
 
 _PATIENCE = 60.0  # seconds, for everything
 _STILL = 1.0  # between two pictures that must be the same
+_SCENE = 900  # pixels from the left; then come the controls
 
 
 class _Page(QWebEnginePage):
@@ -52,7 +54,10 @@ def browse(url, folder, scripts):
             if time.monotonic() > ends:
                 sys.exit(f"not within {_PATIENCE:g} s: {what}; console: {page.errors}")
 
-    answers = []
+    def scene():
+        return view.grab().toImage().copy(0, 0, _SCENE, view.height())
+
+    answers, last = [], scene()
     for number, script in enumerate(scripts):
         said = [None]
         while not said[-1]:
@@ -60,11 +65,15 @@ def browse(url, folder, scripts):
             page.runJavaScript(script, said.append)
             work(script, _PATIENCE, lambda said=said, count=count: len(said) > count)
         answers.append(said[-1])
-        before, picture = None, view.grab().toImage()
-        while picture != before:
-            work(f"a picture that keeps still after {script}", _STILL)
-            before, picture = picture, view.grab().toImage()
-        picture.save(str(folder / f"{number}.png"))
+        before, now = last, scene()
+        while now == last:
+            work(f"another scene after {script}", _STILL)
+            now = scene()
+        while now != before:
+            work(f"a scene that keeps still after {script}", _STILL)
+            before, now = now, scene()
+        last = now
+        view.grab().save(str(folder / f"{number}.png"))
     return {"answers": answers, "errors": page.errors}
 
 

@@ -227,11 +227,11 @@ class Viewer:
             points, labels = view.points()
             rows = np.flatnonzero(labels > 0)
             rows = rows[:: len(rows) // _POINTS + 1]
-            colors = np.array(
-                [_bytes(0.6 * object_color(i)) for i in labels[rows].tolist()], np.uint8
-            )
-            path, style = f"/points/{number}/seen", {"point_size": 0.002, "visible": number == 0}
-            self._add("point_cloud", path, points[rows].astype(np.float32), colors, **style)
+            shades = [_bytes(0.6 * object_color(i)) for i in labels[rows].tolist()]
+            cloud = points[rows].astype(np.float32), np.array(shades, np.uint8)
+            style = {"point_size": 0.002, "visible": number == 0}
+            if len(rows):  # browsers complain of clouds without points
+                self._add("point_cloud", f"/points/{number}/seen", *cloud, **style)
             self._box(f"view {number}", number == 0, f"/points/{number}/")
             picture = None if view.color is None else view.color[::4, ::4]
             path, camera = f"/cameras/{number}", (view.intrinsics, view.shape)
