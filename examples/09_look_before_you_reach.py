@@ -7,7 +7,7 @@ Two hand poses behind a box. One view says of neither whether it is free. ``next
 of 64 views would settle it; with that view in the map both are reached, the second over an object
 that nobody had seen. ::
 
-    python examples/09_look_before_you_reach.py [--picture FILE.png]
+    python examples/09_look_before_you_reach.py [--picture FILE.png] [--view]
 """
 
 import argparse
@@ -25,6 +25,7 @@ START = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]  # radians
 
 parser = argparse.ArgumentParser(description="Which view would let a motion through?")
 parser.add_argument("--picture", type=Path, default=Path("out/examples/09.png"))
+parser.add_argument("--view", action="store_true", help="then show it in the browser")
 arguments = parser.parse_args()
 
 # %%
@@ -66,19 +67,15 @@ for name, hand in reaches.items():
         print(f"{name}: {look.plan.status}, {look.plan.message.split(';')[0]}")
         if look.plan.solved or look.best is None:
             break
-        value = look.values[look.best]
-        print(
-            f"  P(collision) {look.risk:.2f}; view {look.best} would show {100 * value.shown:.0f} %"
-            f" of that, and let the motion through with P {value.go:.2f}"
-        )
-        chosen.setdefault(name, (look, cameras[look.best]))
+        print(f"  {look.text()}")
+        chosen.setdefault(name, (look, cameras[look.best], checker))
         seen = render(scene, cameras[look.best], noise=scene.noise, seed=look.best)
         maps[name].append(maps[name][-1].update(seen))
 
 # %%
 # Left: what the first view leaves open, 2 to 20 cm over the table, and the candidate views
 # around it, the better the brighter. Middle: what the best one sees. Right: what is known then.
-look, camera = chosen["far"]
+look, camera, checker = chosen["far"]
 figure = Figure(figsize=(13.5, 4.6), layout="constrained")
 axes = figure.subplots(1, 3)
 x = y = np.arange(-0.3, 0.3, 0.005)
@@ -104,3 +101,12 @@ axes[0].plot(*(0.33 * eye[:2]), "w^")
 axes[1].imshow(np.where(render(scene, camera).labels > 0, render(scene, camera).labels, np.nan))
 axes[1].set(title="what the chosen view sees", xticks=[], yticks=[])
 save_figure(figure, arguments.picture)
+
+# %%
+# The same in the browser: what was seen, the refused motion and its risk, the view to take.
+if arguments.view:
+    from vprism_plan.viz.viewer import Viewer
+
+    viewer = Viewer(maps["far"][0], checker=checker, look=look)
+    print(f"open {viewer.url}")
+    viewer.wait()

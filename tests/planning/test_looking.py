@@ -85,6 +85,8 @@ def test_no_view_is_worth_less_than_none_and_the_best_is_first(found):
         assert value.entropy >= 0.0
     assert sorted(found.ranking) == list(range(len(VIEWS)))
     assert worth[found.best] == max(worth) > 0.3
+    np.testing.assert_array_equal(found.views, VIEWS)
+    assert f"view {found.best} of {len(VIEWS)} would show " in found.text()
 
 
 def test_the_side_that_nobody_saw_is_better_than_the_same_again(checker, goal, found):
@@ -122,6 +124,7 @@ def test_where_nothing_hides_no_view_is_asked_for(checker):
     found = vp.next_view(checker, START, [0.02, -0.2, 0.2], VIEWS)
     assert found.plan.solved
     assert (found.risk, found.utility, found.best) == (0.0, 1.0, None)
+    assert found.text().endswith(f"none of {len(VIEWS)} views shows anything that may be touched")
 
 
 def test_a_seen_thing_in_the_way_has_no_view(checker):
@@ -129,6 +132,7 @@ def test_a_seen_thing_in_the_way_has_no_view(checker):
     assert found.plan.status == "invalid_goal"
     assert found.values == found.ranking == ()
     assert found.best is None
+    assert found.text().startswith("no motion to look for (invalid_goal)")
 
 
 def test_a_camera_on_a_link_is_where_the_robot_can_bring_it(checker):

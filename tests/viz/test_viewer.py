@@ -2,7 +2,9 @@
 """The viewer's scene holds the map and the robot, follows its controls, and ends."""
 
 import json
-import urllib.request
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from vprism_plan.cli import main
 from vprism_plan.errors import ConfigError, MissingDependencyError
 from vprism_plan.simulation import Box, Camera, Scene, render
 from vprism_plan.viz.robot_plot import link_meshes
-from vprism_plan.viz.viewer import EntropyVolume
+from vprism_plan.viz.viewer import entropy_cloud
 
 viser = pytest.importorskip("viser", reason="viser is not installed (extra `viewer`)")
 
@@ -33,15 +35,31 @@ def small_map():
 @pytest.fixture(scope="module")
 def arm(repository):
     base = np.eye(4)
-    base[0, 3] = -0.5
+    base[0, 3], base[2, 3] = -0.5, -0.03
     return vp.Robot.from_urdf(repository / "urdf" / "planar3.urdf", base_pose=base)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def trajectory(arm):
     from vprism_plan.planning import time_parameterize
 
-    return time_parameterize(arm, np.array([[0.3, 0.2, 0.1], [1.0, -0.4, 0.6]]))
+    return time_parameterize(arm, np.array([[0.9, -0.4, 0.1], [-0.3, 0.4, 0.3]]))
+
+
+@pytest.fixture(scope="module")
+def checker(small_map, arm):
+    return vp.CollisionChecker(vp.World(small_map), arm)
+
+
+@pytest.fixture(scope="module")
+def look(checker, trajectory):
+    """Which of three views would help a plan that was refused."""
+    from vprism_plan.planning import PlanReport, PlanResult
+
+    middle, path = np.array([-0.05, 0.0, 0.03]), trajectory.positions[[0, -1]]
+    views = [Camera.orbit(middle, 0.8, turn, 0.7).T_world_camera for turn in (0.3, 2.0, 4.0)]
+    refused = PlanResult(None, "too_risky", PlanReport("rrt", 0, 1.0), approximate_path=path)
+    return vp.next_view(checker, path[0], path[1], views, result=refused)
 
 
 @pytest.fixture
@@ -53,13 +71,94 @@ def shown(small_map, arm, trajectory):
     viewer.stop()
 
 
-def test_the_scene_holds_map_and_robot_and_a_browser_is_served(shown, arm):
-    expected = {"/objects/4", "/objects/7", "/points/4", "/points/7", "/cameras/0",
-                "/entropy/cloud", "/entropy/slice", "/robot/spheres", "/robot/path"}  # fmt: skip
-    assert expected <= set(shown.nodes)
-    assert {f"/robot/solids/{link}/0" for link in arm.geometry} <= set(shown.nodes)
-    with urllib.request.urlopen(shown.url, timeout=10) as page:
-        assert b"<html" in page.read().lower()
+@pytest.fixture
+def story(small_map, checker, look):
+    from vprism_plan.viz.viewer import Viewer
+
+    viewer = Viewer(small_map, checker=checker, look=look, resolution=0.02, port=0)
+    yield viewer
+    viewer.stop()
+
+
+def test_the_scene_holds_views_map_and_robot(shown, arm, small_map):
+    expected = {"/objects/4", "/objects/7", "/points/0/seen", "/cameras/0", "/entropy/cloud",
+                "/robot/spheres", "/robot/path"}  # fmt: skip
+    solids = link_meshes({}, arm.geometry)
+    expected |= {f"/robot/solids/{link}/{number}" for link, number, _ in solids}
+    assert set(shown.nodes) == expected
+    points, labels = small_map.views[0].points()
+    seen = shown.nodes["/points/0/seen"]
+    np.testing.assert_allclose(seen.points, points[labels > 0], atol=1e-3)
+    assert len(np.unique(seen.colors, axis=0)) == 2
+
+
+def test_every_view_is_shown_by_its_own_box_also_one_that_saw_no_object(small_map):
+    from vprism_plan.viz.viewer import Viewer
+
+    first, down = small_map.views[0], np.diag([1.0, -1.0, -1.0, 1.0])
+    down[:3, 3] = 1.0, 1.0, 0.5  # over the bare table
+    bare = np.full(first.shape, 0.5), np.zeros(first.shape, np.int32)
+    away = vp.Observation(*bare, first.intrinsics, down)
+    viewer = Viewer(small_map.update(away), resolution=0.03, port=0)
+    try:
+        assert "/points/1/seen" not in viewer.nodes
+        seen = viewer.nodes["/points/0/seen"]
+        viewer.controls["view 1"].value = True
+        assert seen.visible
+        viewer.controls["view 0"].value = False
+        assert not seen.visible
+        np.testing.assert_allclose(viewer.nodes["/cameras/1"].position, down[:3, 3])
+    finally:
+        viewer.stop()
+
+
+def test_the_path_is_coloured_by_its_risk_and_the_best_view_stands_where_it_is(story, look, arm):
+    risk = story.risk.per_waypoint
+    assert risk.min() == 0.0
+    assert risk.max() > 0.5
+    pieces = story.nodes["/robot/path"]
+    assert len(pieces.points) == len(risk) - 1
+    red = pieces.colors[:, 0, 0].astype(float) - pieces.colors[:, 0, 2]
+    assert red[risk[:-1] == risk.max()].min() > red[risk[:-1] == 0.0].max()
+    np.testing.assert_allclose(story.trajectory.positions[-1], look.plan.approximate_path[-1])
+    assert look.best is not None
+    frustum = story.nodes["/next/view"]
+    np.testing.assert_allclose(frustum.position, look.views[look.best][:3, 3], atol=1e-6)
+    assert len(story.nodes["/next/others"].points) == len(look.views)
+
+
+_LABEL = "[...document.querySelectorAll('label')].find(l => l.innerText === 'objects')"
+_TIME = "[...document.querySelectorAll('[role=slider]')].at(-1)"
+_RISK = "[...document.querySelectorAll('p')].find(p => p.innerText.includes(' here: '))"
+_END = "new KeyboardEvent('keydown', {key: 'End', bubbles: true})"
+
+
+def test_a_browser_shows_all_of_it_and_its_slider_moves_the_robot(story, look, tmp_path):
+    pytest.importorskip("PyQt6.QtWebEngineWidgets", exc_type=ImportError)
+    from matplotlib.image import imread
+
+    there = f" {story.risk.per_waypoint[-1]:.2f}"
+    scripts = [
+        f"{_LABEL} && document.querySelector('canvas') && document.body.innerText",
+        f"document.getElementById({_LABEL}.htmlFor).click() || true",
+        f"{_TIME}.focus(), {_TIME}.dispatchEvent({_END}), {_RISK}.innerText.endsWith('{there}')",
+    ]
+    program = [sys.executable, str(Path(__file__).with_name("browser.py")), story.url, tmp_path]
+    done = subprocess.run(
+        [*program, *scripts], capture_output=True, text=True, timeout=90, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    assert said["errors"] == []
+    for text in ("view 0", "P(occupied)", story.risk.text(), look.text()):
+        assert text in said["answers"][0]
+    assert "P(collision) here: 0.00" in said["answers"][0]
+    ends = story.robot.sphere_centers(look.plan.approximate_path[-1:])[0]
+    np.testing.assert_allclose(story.nodes["/robot/spheres"].batched_positions, ends, atol=1e-6)
+    whole, without, moved = (imread(tmp_path / f"{n}.png")[:, :900, :3] for n in range(3))
+    assert len(np.unique((255 * whole).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
+    for one, other in ((whole, without), (without, moved)):  # the objects cover 0.2 %
+        assert (np.abs(one - other).max(axis=2) > 0.1).mean() > 0.0005
 
 
 def test_the_robot_follows_the_trajectory(shown, arm, trajectory):
@@ -97,20 +196,15 @@ def test_boxes_hide_what_they_name_also_when_it_is_drawn_again(shown):
     assert shown.nodes["/entropy/cloud"].visible
 
 
-def test_entropy_is_drawn_where_it_is(small_map):
-    volume = EntropyVolume(small_map, 0.02)
-    points, _ = volume.cloud(0.4)
-    assert len(points)
-    assert (small_map.entropy(points.astype(np.float64)) > 0.4 - 1e-5).all()
-    assert (small_map.support(points.astype(np.float64)) > 0).all()
-    mesh = volume.slice(0.05)
-    assert np.abs(mesh.vertices[:, 2] - 0.05).max() <= 0.01 + 1e-9
-    colors = mesh.visual.vertex_colors[:, :3].astype(float)
-    known = (colors != 200).any(axis=1)  # grey where the map repeats its prior
-    support = small_map.support(np.asarray(mesh.vertices))
-    assert support[known].min() > support[~known].max()
-    entropy = small_map.entropy(np.asarray(mesh.vertices))
-    assert np.corrcoef(colors[known].sum(axis=1), entropy[known])[0, 1] > 0.9
+def test_entropy_is_drawn_where_it_is(small_map, shown):
+    points, nats = entropy_cloud(small_map, 0.02)
+    np.testing.assert_allclose(nats, small_map.entropy(points))
+    assert (small_map.support(points) > 0).all()
+    shown.show_entropy(0.4)
+    drawn = shown.nodes["/entropy/cloud"]
+    np.testing.assert_allclose(drawn.points, points[nats >= 0.4], atol=1e-3)
+    brightness = drawn.colors.astype(float).sum(axis=1)
+    assert np.corrcoef(brightness, nats[nats >= 0.4])[0, 1] > 0.9
 
 
 def test_solids_move_with_their_links(shown, arm):
@@ -185,32 +279,46 @@ def test_without_viser_the_message_names_the_extra(monkeypatch, tmp_path, capsys
     assert "vprism_plan[viewer]" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("goal", [(1.3, -0.2, 0.2), (-0.3, 0.8, 0.6)])
 def test_the_command_serves_a_plan_until_it_is_interrupted(
-    small_map, arm, trajectory, repository, tmp_path, monkeypatch, capsys
+    goal, small_map, repository, tmp_path, monkeypatch, capsys
 ):
-    from vprism_plan.planning import write_trajectory
     from vprism_plan.viz.viewer import Viewer
 
     small_map.save(tmp_path / "map.safetensors")
-    write_trajectory(tmp_path / "trajectory.json", arm, trajectory, frame_id="world")
-    report = {"base_pose": arm.base_pose.tolist()}
-    (tmp_path / "report.json").write_text(json.dumps(report))
-    stood = []
+    urdf, plan = repository / "urdf" / "planar3.urdf", tmp_path / "plan"
+    ends = ["--start", 0.9, -0.4, 0.1, "--goal", *goal, "--max-risk", 0.05]
+    place = ["--base-xyz", -0.5, 0.0, 0.0, "--base-yaw", 0.0, "--output", plan]
+    asked = ["plan", tmp_path / "map.safetensors", "--robot", urdf, *ends, *place, "--json"]
+    refused = main([str(a) for a in asked])
+    report = json.loads(capsys.readouterr().out)
+    assert refused == (report["plan"]["status"] == "too_risky") == (goal[0] < 0.0)
+    viewers = []
 
     def interrupt(self):
-        stood.append(self.robot.base_pose)
+        viewers.append(self)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Viewer, "wait", interrupt)
-    urdf = repository / "urdf" / "planar3.urdf"
-    arguments = ["view", tmp_path, "--robot", urdf, "--port", "0", "--json"]
+    arguments = ["view", plan, "--robot", urdf, "--port", "0", "--json"]
     assert main([str(a) for a in arguments]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert "/robot/path" in said["nodes"]
-    np.testing.assert_array_equal(stood[0], arm.base_pose)
-    other = ["view", tmp_path, "--robot", repository / "urdf" / "ur5e.urdf", "--port", "0"]
-    assert main([str(a) for a in other]) == 2
-    assert "planned for the joints" in capsys.readouterr().err
+    assert {"/robot/path", "/next/others"} <= set(said["nodes"])
+    assert ("/next/view" in said["nodes"]) == refused
+    (viewer,) = viewers
+    np.testing.assert_array_equal(viewer.robot.base_pose, report["base_pose"])
+    path = report["approximate_path"] if refused else report["path"]
+    np.testing.assert_allclose(viewer.trajectory.positions[-1], path[-1])
+    planned = report["plan"]["risk"]["probability"]
+    assert viewer.risk.probability == pytest.approx(planned, abs=0.05)
+    assert said["next_view"].startswith(f"P(collision) is {planned:.2f}; ")
+    other = ["view", plan, "--robot", repository / "urdf" / "ur5e.urdf", "--port", "0"]
+    if not refused:
+        assert main([str(a) for a in other]) == 2
+        assert "planned for the joints" in capsys.readouterr().err
+    (plan / "report.json").write_text("{}")
+    assert main([str(a) for a in arguments]) == 2
+    assert "is not a report of `plan`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("what", ["empty folder", "a view", "nothing"])

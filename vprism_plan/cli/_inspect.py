@@ -13,11 +13,13 @@ from vprism_plan.cli._console import Console
 from vprism_plan.cli._maps import load
 from vprism_plan.cli._parsing import Command
 from vprism_plan.cli._placing import Surroundings, read_robot, standing
-from vprism_plan.cli._plans import bake, checks
+from vprism_plan.cli._plans import POLICIES, bake, checks
 from vprism_plan.errors import ConfigError, MapError, PlanningError
 
 if TYPE_CHECKING:
+    from vprism_plan.collision import CollisionChecker
     from vprism_plan.mapping import VPrismMap
+    from vprism_plan.planning import NextView
     from vprism_plan.robots import Robot
 
 _OFTEN = 0.3  # of random configurations: a pair of links that overlaps in more is named
@@ -167,14 +169,21 @@ def run_view(command: Command, console: Console) -> int:
                     f"{list(robot.joint_names)}: give the robot it was planned for"
                 )
         robot = _placed(command, robot, m, plan or {}, console)
-    where = {"host": command.host, "port": command.port}
+    asked: dict[str, Any] = {"level": command.level}
+    if robot is not None and plan is not None:
+        asked["checker"], asked["look"] = _risk_and_look(m, robot, plan, console)
+    look = asked.get("look")
     with console.stage("scene"):
-        viewer = Viewer(m, robot, trajectory, level=command.level, **where)
+        viewer = Viewer(m, robot, trajectory, **asked, host=command.host, port=command.port)
     try:
         shown = sorted({path.split("/")[1] for path in viewer.nodes})
         payload: dict[str, Any] = {"url": viewer.url, "shown": shown, "nodes": sorted(viewer.nodes)}
         payload["timings"] = console.timings
+        payload["risk"] = None if viewer.risk is None else viewer.risk.to_dict()
+        payload["next_view"] = None if look is None else look.text()
         lines = [f"{command.input}: {', '.join(shown)}"]
+        lines += [] if viewer.risk is None else [viewer.risk.text()]
+        lines += [] if look is None else [look.text()]
         if robot is None and plan is not None:
             lines.append("give --robot URDF to see the robot and its path")
         console.finish(payload, [*lines, f"open {viewer.url} in a browser; Ctrl-C ends it"])
@@ -205,11 +214,53 @@ def _map_and_plan(path: Path, console: Console) -> tuple["VPrismMap", dict[str, 
             f"{path} holds no map.safetensors and report.json; give the output folder of "
             "`vprism-plan plan` or `demo`, or a .safetensors map"
         )
+    from vprism_plan.collision import CheckerConfig
+    from vprism_plan.planning import PlanReport, PlanResult
+    from vprism_plan.world import WorldConfig
+
     report = read_json(file, MapError)
     with reading(file, "a report of `plan`", MapError):
-        if "base_pose" in report:
-            report["base_pose"] = np.array(report["base_pose"], dtype=np.float64)
+        report["base_pose"] = np.array(report["base_pose"], dtype=np.float64)
+        said, rules = report["plan"], report["world"]
+        numbers = PlanReport(said["planner"], said["seed"], said["time_limit"])
+        paths = [
+            None if report[name] is None else np.array(report[name], dtype=np.float64)
+            for name in ("path", "approximate_path")
+        ]
+        report["result"] = PlanResult(
+            paths[0], said["status"], numbers, said["message"], approximate_path=paths[1]
+        )
+        report["world"] = WorldConfig(**{name: rules[name] for name in POLICIES})
+        own = {name: rules[name] for name in ("margin", "max_risk", "allowed_contacts")}
+        report["checker"] = CheckerConfig(**own)
     return load(saved, console), report
+
+
+def _risk_and_look(
+    m: "VPrismMap", robot: "Robot", plan: dict[str, Any], console: Console
+) -> tuple["CollisionChecker", "NextView | None"]:
+    """Return the checker that a plan was made with, and where to look next for its motion, among
+    64 places around the objects, as far as the first camera; None without a bound on risk."""
+    from vprism_plan.collision import CollisionChecker
+    from vprism_plan.planning import next_view
+    from vprism_plan.simulation import Camera
+    from vprism_plan.world import World
+
+    with console.stage("bake"):
+        world = World(m, plan["world"])
+    checker = CollisionChecker(world, robot, plan["checker"])
+    if checker.max_risk is None:
+        return checker, None
+    around = Surroundings.of(m)
+    middle = np.array([*around.middle, around.table])
+    away = float(np.linalg.norm(around.camera - middle))
+    views = [
+        Camera.orbit(middle, away, azimuth, elevation).T_world_camera
+        for azimuth in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+        for elevation in (0.5, 0.7, 0.9, 1.1)
+    ]
+    with console.stage("look"):
+        return checker, next_view(checker, None, None, views, result=plan["result"])
 
 
 def _placed(
@@ -217,7 +268,7 @@ def _placed(
 ) -> "Robot":
     """Return the robot where it is asked to stand, where it stood, or where it would stand."""
     around, xyz = Surroundings.of(m), command.base_xyz
-    if xyz is None and "base_pose" in plan:
+    if xyz is None and plan:
         if command.base_yaw is None:
             return robot.with_base_pose(plan["base_pose"])
         xyz = plan["base_pose"][:3, 3]

@@ -186,9 +186,10 @@ def _export(command: _Parser) -> None:
 def _view(command: _Parser) -> None:
     """Look at a map, and at a plan, in the browser; Ctrl-C ends it.
 
-    Surfaces of the objects at any P(occupied), the observed points, the entropy as a cloud and
-    as a slice; the robot along the planned trajectory, or moved by hand. Needs the extra
-    `viewer`.
+    The cameras and what each saw, the surfaces of the objects at any P(occupied), the entropy; the
+    robot moved by hand, or along its plan (of a refused one along the safest motion that was found)
+    with the probability of collision; and where to look next for it, of 64 places around the
+    objects. Needs the extra `viewer`.
     """
     take = command.take
     text = "a .safetensors map, or the output folder of `plan` or `demo`"

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _PICTURES = ("scene.png", "map.png", "plan.png")
 _DATA = ("map.safetensors", "meshes/object_*.ply", "trajectory.json", "report.json")
 PLAN_FILES = (*_PICTURES, *_DATA)
-_POLICIES = ("occluded", "unobserved", "level", "resolution")  # of a world, in the report
+POLICIES = ("occluded", "unobserved", "level", "resolution")  # of a world, in the report
 _PROFILE = 64  # clearances along the path in the report
 
 _HIDDEN = {
@@ -200,6 +200,7 @@ def solve(
             "goal": ends[1],
             "chosen_automatically": chosen,
             "path": path,
+            "approximate_path": result.approximate_path,
             "plan": {
                 "status": result.status,
                 "message": result.message,
@@ -210,10 +211,13 @@ def solve(
             "explanation": None if result.explanation is None else result.explanation.text(),
             "map": describe_map(world.map),
             "world": {
-                **{name: getattr(world.config, name) for name in _POLICIES},
+                **{name: getattr(world.config, name) for name in POLICIES},
                 "nodes": list(world.field.distance.shape),
                 "margin": checker.config.margin,
                 "max_risk": checker.config.max_risk,
+                "allowed_contacts": {
+                    name: sorted(ids) for name, ids in checker.config.allowed_contacts.items()
+                },
             },
             "meshes": {str(i): {"triangles": len(mesh.faces)} for i, mesh in meshes.items()},
             "timings": console.timings,

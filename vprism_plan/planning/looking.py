@@ -58,6 +58,8 @@ class NextView:
         plan: the motion as it stands; where it is "exact", no view is needed.
         risk: probability of its collision, by worlds that its search has not seen.
         utility: expected, without another view.
+        views: the poses that were given, `T_world_camera` (v, 4, 4).
+        intrinsics, shape: of their camera and its images.
         values: of the views, in the order they were given; empty without a motion.
         ranking: their indices, best first.
         best: index of the first; None where no view shows anything that may be touched.
@@ -66,9 +68,26 @@ class NextView:
     plan: PlanResult
     risk: float
     utility: float
+    views: Float[np.ndarray, "v 4 4"]
+    intrinsics: Float[np.ndarray, "3 3"]
+    shape: tuple[int, int]
     values: tuple[ViewValue, ...]
     ranking: tuple[int, ...]
     best: int | None
+
+    def text(self) -> str:
+        """Return what the best view would do, in one line."""
+        if not self.values:
+            return f"no motion to look for ({self.plan.status}): {self.plan.message}"
+        now = f"P(collision) is {self.risk:.2f}"
+        if self.best is None:
+            return f"{now}; none of {len(self.values)} views shows anything that may be touched"
+        value = self.values[self.best]
+        return (
+            f"{now}; view {self.best} of {len(self.values)} would show {100 * value.shown:.0f} % "
+            f"of that, and nothing in the way with probability {value.go:.2f}: then it is "
+            f"{value.risk:.2f}"
+        )
 
 
 def next_view(
@@ -109,22 +128,23 @@ def next_view(
     if not seen and (intrinsics is None or shape is None):
         raise PlanningError("the map has no view to take a camera from: give intrinsics and shape")
     K = np.asarray(seen[0].intrinsics if intrinsics is None else intrinsics, dtype=np.float64)
-    shape = seen[0].depth.shape if shape is None else shape
+    height, width = seen[0].depth.shape if shape is None else shape
+    asked = poses, K, (int(height), int(width))
     found = plan(checker, start, goal, **options) if result is None else result
     path = found.path if found.path is not None else found.approximate_path
     if path is None or found.status not in ("exact", "too_risky"):
-        return NextView(found, float("nan"), 0.0, (), (), None)
+        return NextView(found, float("nan"), 0.0, *asked, (), (), None)
     at = checker.risk_setting(held_out=True)
     price = 1.0 / checker.max_risk
     touches = _touches(at, path)
     risk = float(touches.collides.mean())
-    values = _values(at, touches, poses, K, (int(shape[0]), int(shape[1])), price)
+    values = _values(at, touches, *asked, price)
     order = sorted(
         range(len(values)),
         key=lambda v: (-values[v].utility, -values[v].shown, -values[v].entropy, v),
     )
     best = order[0] if values[order[0]].shown > 0.0 else None
-    return NextView(found, risk, max(0.0, 1.0 - price * risk), values, tuple(order), best)
+    return NextView(found, risk, max(0.0, 1.0 - price * risk), *asked, values, tuple(order), best)
 
 
 def camera_views(

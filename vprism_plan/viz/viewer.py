@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""A map and a robot that moves in it, in the browser (viser; the extra `viewer`)."""
+"""What was seen, the map of it, a motion and its risk, and where to look next, in the browser
+(viser; the extra `viewer`)."""
 
 import contextlib
 import io
@@ -17,85 +18,56 @@ from vprism_plan.viz.plan_plot import hand_path
 from vprism_plan.viz.robot_plot import link_meshes
 
 if TYPE_CHECKING:
-    import trimesh
-
+    from vprism_plan.collision import CollisionChecker
     from vprism_plan.mapping import VPrismMap
-    from vprism_plan.planning import Trajectory
+    from vprism_plan.planning import NextView, Trajectory
     from vprism_plan.robots import Robot
 
-_POINTS = 20_000  # of an object, drawn at most
+_POINTS = 20_000  # of a view, drawn at most
 _POSES = 300  # of a trajectory
-_ROBOT_COLOR = (76, 107, 148)
+_ROBOT_COLOR, _PATH_COLOR, _NEXT_COLOR = (76, 107, 148), (184, 13, 89), (20, 130, 60)
+_RED = 0.1  # probability of collision at most that is red
 _CHUNK = 1 << 16
 _SUPPORTED = 0.5  # of the largest kernel mass: the rim of the lattice has less
 _MOST = 2_000_000  # grid points; a coarser grid is taken above
 
 
-class EntropyVolume:
-    """The entropy of a map (nats) on a grid over its support.
+def entropy_cloud(
+    m: "VPrismMap", resolution: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Return points on a grid (m) that a map supports, and its entropy there (nats).
 
-    Attributes:
-        corners: (2, 3) first and last grid point, m.
-        heights: lowest and highest slice and their distance, m.
-        values: (nx, ny, nz) nats; NaN where the map has little support (see `_SUPPORTED`):
-            there it repeats its prior.
+    Elsewhere it repeats its prior. The grid is coarser than `resolution` (m) where that would be
+    more than `_MOST` points.
     """
+    lower, upper = m.support_bounds()
+    count = float(np.prod((upper - lower) / resolution))
+    resolution *= max(1.0, (count / _MOST) ** (1 / 3))
+    axes = [np.arange(lower[k], upper[k], resolution) for k in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    mass = _in_chunks(m.support, points)
+    points = points[mass > _SUPPORTED * mass.max()]
+    return points, _in_chunks(m.entropy, points)
 
-    def __init__(self, m: "VPrismMap", resolution: float) -> None:
-        lower, upper = m.support_bounds()
-        count = float(np.prod((upper - lower) / resolution))
-        resolution *= max(1.0, (count / _MOST) ** (1 / 3))
-        self._axes = [np.arange(lower[k], upper[k], resolution) for k in range(3)]
-        grid = np.stack(np.meshgrid(*self._axes, indexing="ij"), axis=-1)
-        points = grid.reshape(-1, 3)
-        chunks = [points[i : i + _CHUNK] for i in range(0, len(points), _CHUNK)]
-        values = np.concatenate([m.entropy(chunk) for chunk in chunks])
-        mass = np.concatenate([m.support(chunk) for chunk in chunks])
-        supported = mass > _SUPPORTED * mass.max()
-        self.values: np.ndarray = np.where(supported, values, np.nan).reshape(grid.shape[:3])
-        self._grid, self._top, z = grid, float(np.log(m.n_classes)), self._axes[2]
-        self.heights = float(z[0]), float(z[-1]), round(float(resolution), 4)
-        self.corners = np.stack([grid[0, 0, 0], grid[-1, -1, -1]])
 
-    def cloud(self, at_least: float) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-        """Return the points whose entropy is at least so many nats, and their colours."""
-        with np.errstate(invalid="ignore"):
-            chosen = self.values >= at_least
-        return self._grid[chosen].astype(np.float32), self._colors(self.values[chosen])
-
-    def slice(self, height: float) -> "trimesh.Trimesh":
-        """Return the layer nearest to a height (m) as a flat, coloured surface."""
-        import trimesh
-
-        layer = int(np.abs(self._axes[2] - height).argmin())
-        nx, ny, _ = self.values.shape
-        corner = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)).ravel()
-        faces = corner[:, None] + np.array([[[0, ny, ny + 1]], [[0, ny + 1, 1]]])
-        faces = faces.reshape(-1, 3)
-        faces = np.concatenate([faces, faces[:, ::-1]])  # seen from below as well
-        colors = self._colors(self.values[:, :, layer].reshape(-1))
-        colors = np.column_stack([colors, np.full(len(colors), 255, np.uint8)])
-        points = self._grid[:, :, layer].reshape(-1, 3)
-        return trimesh.Trimesh(points, faces, vertex_colors=colors, process=False)
-
-    def _colors(self, nats: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
-        from matplotlib import colormaps
-
-        shades = colormaps["magma"](np.nan_to_num(nats / self._top), bytes=True)[:, :3]
-        shades[np.isnan(nats)] = 200
-        return np.asarray(shades, dtype=np.uint8)
+def _in_chunks(function: Callable[[Any], Any], points: np.ndarray) -> np.ndarray:
+    chunks = np.array_split(points, len(points) // _CHUNK + 1)
+    return np.concatenate([function(chunk) for chunk in chunks])
 
 
 class Viewer:
-    """A server that shows a map, and a robot in it; it runs until `stop`.
+    """A server that shows a map, a robot in it and where to look next; it runs until `stop`.
 
     Attributes:
         server: the `viser.ViserServer`.
         nodes: what is in the scene, by its path in the scene's tree: "/objects/3",
-            "/points/3", "/cameras/0", "/entropy/cloud", "/entropy/slice", "/robot/spheres",
-            "/robot/solids/LINK/0" (or "mesh0"), "/robot/path"; the table is not among them.
-        controls: sliders and boxes by name: "level", "entropy", "height", "time" with a
-            trajectory, else the names of the joints; and one box for every group of nodes.
+            "/points/0/seen" and "/cameras/0" of view 0, "/entropy/cloud", "/robot/spheres",
+            "/robot/solids/LINK/0" (or "mesh0"), "/robot/path", "/next/view", "/next/others"; the
+            table is not among them.
+        controls: sliders and boxes by name: "level", "entropy", "time" with a trajectory, else the
+            names of the joints; and one box for every group of nodes.
+        risk: the `RiskEstimate` along the trajectory, by worlds that its search has not seen;
+            None without a checker.
     """
 
     def __init__(
@@ -104,6 +76,8 @@ class Viewer:
         robot: "Robot | None" = None,
         trajectory: "Trajectory | None" = None,
         *,
+        checker: "CollisionChecker | None" = None,
+        look: "NextView | None" = None,
         level: float = 0.5,
         resolution: float = 0.01,
         host: str = "127.0.0.1",
@@ -113,8 +87,11 @@ class Viewer:
 
         Args:
             m: a fitted map in a frame with z up.
-            robot: shown with its spheres and solids, where its base stands.
-            trajectory: of that robot; without one its joints can be moved by hand.
+            robot: shown with its spheres and solids, where its base stands; the checker's if None.
+            trajectory: of that robot; if None that of the plan in `look`, without any its joints
+                can be moved by hand.
+            checker: over a `World` of this map: colours the path by its probability of collision.
+            look: what `next_view` said of this map: the views it was asked about, and the best.
             level: P(occupied) at the surfaces of the objects.
             resolution: edge of the grids of surfaces and entropy, metres.
             host: address to listen at; "0.0.0.0" lets other machines connect.
@@ -125,6 +102,13 @@ class Viewer:
             ConfigError: a trajectory without a robot, or of another one.
             MapError: the map has no objects.
         """
+        if robot is None and checker is not None:
+            robot = checker.robot
+        if trajectory is None and robot is not None and look is not None:
+            from vprism_plan.planning import time_parameterize
+
+            path = look.plan.path if look.plan.path is not None else look.plan.approximate_path
+            trajectory = None if path is None else time_parameterize(robot, path)
         if not m.object_ids:
             raise MapError("the map has no objects: there are no surfaces and no entropy to show")
         if trajectory is not None:
@@ -139,6 +123,8 @@ class Viewer:
         import viser
 
         self.map, self.robot, self.trajectory, self._resolution = m, robot, trajectory, resolution
+        self.risk: Any = None
+        self._checker, self._look = checker, look
         self.nodes: dict[str, Any] = {}
         self.controls: dict[str, Any] = {}
         self._surfaces: dict[float, dict[int, Any]] = {}
@@ -181,20 +167,15 @@ class Viewer:
 
     def show_entropy(self, at_least: float) -> None:
         """Draw the points that the map supports and whose entropy (nats) is at least this."""
-        points, colors = self._volume.cloud(float(at_least))
+        points, nats = self._cloud
+        chosen = nats >= at_least
         with self._lock:
             style = self._cleared("/entropy/cloud", "entropy cloud") | {"point_shape": "circle"}
-            if len(points):
+            if chosen.any():
                 style["point_size"] = 0.35 * self._resolution
-                self._add("point_cloud", "/entropy/cloud", points, colors, **style)
-
-    def show_slice(self, height: float) -> None:
-        """Draw the entropy on the horizontal slice nearest to a height (m, world)."""
-        mesh = self._volume.slice(float(height))
-        with self._lock:
-            style = self._cleared("/entropy/slice", "entropy slice")
-            style |= {"cast_shadow": False, "receive_shadow": False}
-            self._add("mesh_trimesh", "/entropy/slice", mesh, **style)
+                colors = _shades("magma", nats[chosen] / np.log(self.map.n_classes))
+                cloud = points[chosen].astype(np.float32)
+                self._add("point_cloud", "/entropy/cloud", cloud, colors, **style)
 
     def place_robot(self, q: Float[np.ndarray, "dof"]) -> None:
         """Move the robot to a configuration."""
@@ -209,60 +190,77 @@ class Viewer:
                 node.wxyz, node.position = _quaternion(pose), pose[:3, 3]
 
     def _fill(self, level: float) -> None:
-        scene, gui = self.server.scene, self.server.gui
+        scene, gui, plane = self.server.scene, self.server.gui, self.map.plane
+        gui.main_panel.dock_right()
         scene.set_up_direction("+z")
-        self._volume = EntropyVolume(self.map, self._resolution)
-        middle = 0.5 * self._volume.corners.sum(axis=0)
-        plane = self.map.plane
+        self._cloud = entropy_cloud(self.map, self._resolution)
+        middle = 0.5 * (self._cloud[0].min(axis=0) + self._cloud[0].max(axis=0))
         table = float((plane.offset - plane.normal[:2] @ middle[:2]) / plane.normal[2])
         size: dict[str, Any] = {"width": 2.0, "height": 2.0, "cell_size": 0.1, "section_size": 0.5}
         style: dict[str, Any] = {"plane_color": (235, 232, 225), "plane_opacity": 0.8}
         scene.add_grid("/table", position=(*middle[:2], table), **size, **style)
-        self._add_views()
-        with gui.add_folder("map"):
+        with gui.add_folder("what was seen"):
+            self._add_views()
+        with gui.add_folder("what the map believes"):
             self._box("objects", True, "/objects/")
             bounds = (0.05, 0.95, 0.05, round(level, 2))
-            self._slider("level", "level: P(occupied)", self.show_level, *bounds)
-            self._box("observed points", False, "/points/")
-            self._box("cameras", False, "/cameras/")
-        with gui.add_folder("entropy"):
+            self._slider("level", "P(occupied)", self.show_level, *bounds)
+            self._box("entropy cloud", True, "/entropy/cloud")
             top = float(np.log(self.map.n_classes))
             bounds = (0.0, round(top, 2), 0.01, round(0.3 * top, 2))
-            self._box("entropy cloud", True, "/entropy/cloud")
-            self._slider("entropy", "entropy at least (nats)", self.show_entropy, *bounds)
-            self._box("entropy slice", False, "/entropy/slice")
-            bounds = (*self._volume.heights, round(float(middle[2]), 3))
-            self._slider("height", "height of the slice (m)", self.show_slice, *bounds)
+            self._slider("entropy", "at least (nats)", self.show_entropy, *bounds)
         self.show_level(self.controls["level"].value)
         self.show_entropy(self.controls["entropy"].value)
-        self.show_slice(self.controls["height"].value)
         if self.robot is not None:
             self._add_robot(self.robot)
-        eye = self.map.views[0].camera_center
-        self.server.initial_camera.position = tuple(middle + 1.5 * (eye - middle))
+        if self._look is not None:
+            self._add_look(self._look)
+        x, y, z = self.map.views[0].camera_center - middle
+        # From beside the first camera, which would stand before what it saw.
+        eye = middle + 1.35 * np.array([0.6 * x + 0.8 * y, 0.6 * y - 0.8 * x, 1.4 * z])
+        self.server.initial_camera.position = tuple(eye)
         self.server.initial_camera.look_at = tuple(middle)
 
     def _add_views(self) -> None:
-        seen = [view.points() for view in self.map.views]
-        for object_id in self.map.object_ids:
-            points = np.concatenate([p[labels == object_id] for p, labels in seen])
-            points = points[:: max(1, len(points) // _POINTS)].astype(np.float32)
-            color, path = _bytes(0.6 * object_color(object_id)), f"/points/{object_id}"
-            self._add("point_cloud", path, points, color, point_size=0.002, visible=False)
+        self._box("cameras", True, "/cameras/")
         for number, view in enumerate(self.map.views):
-            height, width = view.shape
-            self._add(
-                "camera_frustum",
-                f"/cameras/{number}",
-                fov=2.0 * float(np.arctan(0.5 * height / view.intrinsics[1, 1])),
-                aspect=width / height,
-                scale=0.08,
-                thickness=0.002,
-                wxyz=_quaternion(view.pose),
-                position=tuple(view.camera_center),
-                image=None if view.color is None else view.color[::4, ::4],
-                visible=False,
-            )
+            points, labels = view.points()
+            rows = np.flatnonzero(labels > 0)
+            rows = rows[:: len(rows) // _POINTS + 1]
+            shades = [_bytes(0.6 * object_color(i)) for i in labels[rows].tolist()]
+            cloud = points[rows].astype(np.float32), np.array(shades, np.uint8)
+            style = {"point_size": 0.002, "visible": number == 0}
+            if len(rows):  # browsers complain of clouds without points
+                self._add("point_cloud", f"/points/{number}/seen", *cloud, **style)
+            self._box(f"view {number}", number == 0, f"/points/{number}/")
+            picture = None if view.color is None else view.color[::4, ::4]
+            path, camera = f"/cameras/{number}", (view.intrinsics, view.shape)
+            self._add_camera(path, view.pose, camera, image=picture, color=(20, 20, 20))
+
+    def _add_camera(
+        self, path: str, pose: np.ndarray, camera: tuple[np.ndarray, tuple[int, int]], **style: Any
+    ) -> None:
+        """A frustum; its camera is given by intrinsics and (height, width), pixels."""
+        K, (height, width) = camera
+        style |= {"fov": 2.0 * float(np.arctan(0.5 * height / K[1, 1])), "aspect": width / height}
+        style |= {"wxyz": _quaternion(pose), "position": tuple(pose[:3, 3])}
+        self._add("camera_frustum", path, scale=0.12, thickness=0.003, **style)
+
+    def _add_look(self, look: "NextView") -> None:
+        """The views that were asked about, the better the brighter, and the best of them."""
+        with self.server.gui.add_folder("where to look next"):
+            self._box("next view", True, "/next/")
+            dots = ". Dots: all views, the better the brighter." if look.values else ""
+            self.server.gui.add_markdown(look.text() + dots)
+        if look.values:
+            worth = np.array([value.utility for value in look.values])
+            style = {"point_size": 0.003, "point_shape": "circle"}
+            places = look.views[:, :3, 3].astype(np.float32)
+            colors = _shades("viridis", worth / max(float(worth.max()), 1e-9))
+            self._add("point_cloud", "/next/others", places, colors, **style)
+        if look.best is not None:
+            camera, pose = (look.intrinsics, look.shape), look.views[look.best]
+            self._add_camera("/next/view", pose, camera, color=_NEXT_COLOR, variant="filled")
 
     def _add_robot(self, robot: "Robot") -> None:
         import trimesh
@@ -302,15 +300,28 @@ class Viewer:
 
     def _add_motion(self, robot: "Robot", trajectory: "Trajectory") -> None:
         times = np.linspace(0.0, trajectory.duration, _POSES)
-        hand = hand_path(robot, trajectory.sample(times)[0]).astype(np.float32)
-        pieces = np.stack([hand[:-1], hand[1:]], axis=1)
-        self._add("line_segments", "/robot/path", pieces, (184, 13, 89), thickness=0.006)
+        poses = trajectory.sample(times)[0]
+        hand = hand_path(robot, poses).astype(np.float32)
+        colors = np.full((_POSES, 3), _PATH_COLOR, np.uint8)
+        if self._checker is not None:
+            self.risk = self._checker.collision_probability(poses, held_out=True)
+            top = max(float(self.risk.per_waypoint.max()), _RED)
+            colors = _shades("turbo", 0.07 + 0.83 * self.risk.per_waypoint / top)
+            self.server.gui.add_markdown(f"{self.risk.text()}. Blue: 0, red: {top:.2f}.")
+        pieces, shades = (np.stack([a[:-1], a[1:]], axis=1) for a in (hand, colors))
+        self._add("line_segments", "/robot/path", pieces, shades, thickness=0.008)
         self._box("path of the hand", True, "/robot/path")
+        here = self.server.gui.add_markdown("", visible=self.risk is not None)
 
         def follow(time: float) -> None:
             self.place_robot(trajectory.sample(np.array([time]))[0][0])
+            if self.risk is not None:
+                row = int(np.abs(times - time).argmin())
+                here.content = f"P(collision) here: **{self.risk.per_waypoint[row]:.2f}**"
+                self.nodes["/robot/spheres"].batched_colors = colors[row]
 
-        self._slider("time", "time (s)", follow, 0.0, max(trajectory.duration, 0.01), 0.01, 0.0)
+        end = round(trajectory.duration + 0.005, 2)
+        self._slider("time", "time (s)", follow, 0.0, end, 0.01, 0.0)
         follow(0.0)
 
     def _add(self, kind: str, path: str, *content: Any, **style: Any) -> None:
@@ -345,6 +356,13 @@ class Viewer:
 
 def _bytes(color: Float[np.ndarray, "3"]) -> tuple[int, ...]:
     return tuple(round(255 * float(c)) for c in np.clip(color, 0.0, 1.0))
+
+
+def _shades(name: str, values: Float[np.ndarray, " n"]) -> UInt8[np.ndarray, "n 3"]:
+    """The colours that one of matplotlib's maps gives to values in 0..1."""
+    from matplotlib import colormaps
+
+    return np.asarray(colormaps[name](values, bytes=True)[:, :3], dtype=np.uint8)
 
 
 def _arrays(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
