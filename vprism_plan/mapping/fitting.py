@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
-from vprism_plan._arguments import choice, is_whole
+from vprism_plan._arguments import choice, is_whole, number
 from vprism_plan._shapes import Indices, Points
 from vprism_plan.errors import MapError, ObservationError
+from vprism_plan.mapping.changes import Changes, notice, numbered, without_old
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import (
     Posterior,
@@ -45,6 +46,7 @@ from vprism_plan.mapping.training_data import (
     stray_points,
     sunk_objects,
 )
+from vprism_plan.perception.camera import point_image
 from vprism_plan.perception.masks import drop_background
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
@@ -244,24 +246,57 @@ def _views(observations: Any) -> tuple[Observation, ...]:
     return views
 
 
-def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
+def update_map(
+    old: VPrismMap, observation: Observation, prior: Any, forget: float | None
+) -> VPrismMap:
     """See `VPrismMap.update`."""
     if not isinstance(observation, Observation):
         raise ObservationError(f"update got a {type(observation).__name__}; give one Observation")
-    config, plane = old.config, old.plane
-    (observation,) = _usable((observation,), old.views)
-    (observation,), found = examine((observation,), plane, old.views)
-    seen = _object_ids((observation,))
-    views = (*old.views, observation)
     if old.prior is not None and old.prior.own and isinstance(prior, str):
         raise MapError(
             "this map's prior is one of your own; give it again: update(view, prior=...), or "
             "fit_map to ask the package's"
         )
+    (observation,) = _usable((observation,), old.views)
+    if not old.views:
+        return _refitted(old, (observation,), prior)
+    before = old.views
+    if forget is not None:
+        seconds = number("forget", forget, 0.0, unit="seconds", error=MapError)
+        before = without_old(before, observation.time, seconds)
+    (mended,), _ = examine((observation,), old.plane)
+    noticed = notice(mended, before, old.plane, old.changes.retired)
+    same = len(noticed.earlier) == len(old.views)
+    if same and all(a is b for a, b in zip(noticed.earlier, old.views, strict=True)):
+        fitted = _updated(old, numbered(observation, noticed.table, len(before)), prior)
+    else:
+        # Every view says where the table is, also one that no longer shows it.
+        views = tuple(replace(view, plane=old.plane) for view in noticed.earlier)
+        fitted = _refitted(
+            old, (*views, numbered(mended, noticed.table, len(before))), prior
+        )
+    labels = observation.labels, fitted.views[-1].labels
+    changes = Changes.between(
+        old.object_ids, old.changes.retired, fitted.object_ids, noticed.moved, *labels
+    )
+    return replace(fitted, changes=changes)
+
+
+def _refitted(old: VPrismMap, views: tuple[Observation, ...], prior: Any) -> VPrismMap:
+    """Fit all views together, as the old map was."""
+    logger.info("all %d views are fitted together", len(views))
+    guessed = old.prior is not None or not old.object_ids
+    return _fit(views, old.config, old.seed, prior if guessed else None, old.warnings)
+
+
+def _updated(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
+    """Fit one more view of the scene as it was."""
+    config, plane = old.config, old.plane
+    (observation,), found = examine((observation,), plane, old.views)
+    seen = _object_ids((observation,))
+    views = (*old.views, observation)
     if old.prior is not None or not seen or not set(seen) <= set(old.object_ids):
-        logger.info("all %d views are fitted together", len(views))
-        guessed = old.prior is not None or not old.object_ids
-        return _fit(views, config, old.seed, prior if guessed else None, old.warnings)
+        return _refitted(old, views, prior)
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
@@ -292,22 +327,23 @@ def training_data(
 ) -> TrainingData:
     """Observed points, negative samples and their subsampling (section V)."""
     clouds = [_without_strays(*_marked_points(view), config.stray_share) for view in views]
-    points = np.concatenate([cloud for cloud, _ in clouds])
-    labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
+    points = np.concatenate([cloud for cloud, _, _ in clouds])
+    labels = np.concatenate([label for _, label, _ in clouds]).astype(np.int64)
     lower, upper = box_centers(points, labels, object_ids, config.box_trim)
     centers = 0.5 * (lower + upper)
     empty = [points[labels == 0]]
     front: list[np.ndarray] = []
-    for view, (cloud, label) in zip(views, clouds, strict=True):
+    for view, (cloud, label, ends) in zip(views, clouds, strict=True):
         origin = view.camera_center
         empty.append(
             sample_rays(
-                cloud, origin, centers, config.object_radius, config.ray_step, rng,
+                ends, origin, centers, config.object_radius, config.ray_step, rng,
                 config.ray_sampling,
             )
         )  # fmt: skip
         if config.front_distance is not None:
-            seen = sample_in_front(cloud[label > 0], origin, config.front_distance)
+            whole = (ends == cloud).all(axis=1)
+            seen = sample_in_front(cloud[(label > 0) & whole], origin, config.front_distance)
             front.append(grid_subsample(seen, config.front_resolution))
     below = sample_below_plane(
         plane.normal, plane.offset, centers, config.object_radius,
@@ -336,18 +372,30 @@ def training_data(
     )
 
 
-def _marked_points(view: Observation) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """One view's points and labels, -1 where it sees the robot.
+def _marked_points(view: Observation) -> tuple[Points, Indices, Points]:
+    """One view's points and labels, -1 where it sees the robot, and where its free rays end.
 
     The ray before such a point is as empty as any other. The point itself says nothing:
-    if it should belong to what the robot holds, calling it empty would carve that away.
+    if it should belong to what the robot holds, calling it empty would carve that away. So it
+    is with what has gone, and with empty places behind what has come since.
     """
     points, labels = view.points()
-    return points, np.where(view.sees_robot[view.depth > 0], -1, labels)
+    labels = np.where(view.sees_robot[view.depth > 0], -1, labels)
+    if view.clear is None:
+        return points, labels, points
+    kept, gone = view.depth > 0, (view.depth == 0) & (view.clear > 0)
+    image = point_image(view.clear, view.intrinsics, view.pose)
+    cut = (view.clear < view.depth)[kept]
+    ends = np.where(cut[:, None], image[kept], points)
+    ends = np.where((view.clear > 0)[kept][:, None], ends, view.camera_center)
+    labels = np.concatenate([np.where(cut & (labels == 0), -1, labels), np.full(gone.sum(), -1)])
+    return np.concatenate([points, image[gone]]), labels, np.concatenate([ends, image[gone]])
 
 
-def _without_strays(points: Points, labels: Indices, share: float) -> tuple[Points, Indices]:
-    """Return one view's points and labels without flying pixels.
+def _without_strays(
+    points: Points, labels: Indices, ends: Points, share: float
+) -> tuple[Points, Indices, Points]:
+    """Return one view's points, labels and ends of rays without flying pixels.
 
     Their rays go as well: they end in the shadow of what they fringe, and samples along
     them would call that shadow empty.
@@ -358,7 +406,7 @@ def _without_strays(points: Points, labels: Indices, share: float) -> tuple[Poin
         keep[own] = ~stray_points(points[own], share)
     if not keep.all():
         logger.info("%d of %d points taken for flying pixels", (~keep).sum(), len(keep))
-    return points[keep], labels[keep]
+    return points[keep], labels[keep], ends[keep]
 
 
 def new_hinges(

@@ -47,8 +47,10 @@ def examine(
     found: list[str] = []
     for view in views:
         found += [*_pose(view, plane), *_lens(view), *_bend(view, plane), *_sizes(view)]
+    given = views
     views = tuple(_without_what_is_behind_the_surface(view, plane) for view in views)
-    views = agree(mend(views, plane, len(earlier)), earlier)
+    views = tuple(map(_known_clear, given, mend(views, plane, len(earlier))))
+    views = agree(views, earlier)
     found += [text for view in views for text in view.warnings]
     return views, tuple(dict.fromkeys(found))
 
@@ -183,6 +185,13 @@ def _without_what_is_behind_the_surface(view: Observation, plane: Plane) -> Obse
         "support surface, through what was seen of it: a mirror or glass? They count as no return"
     )
     return replace(view, depth=np.where(below, 0.0, view.depth), warnings=(*view.warnings, text))
+
+
+def _known_clear(before: Observation, view: Observation) -> Observation:
+    """Take rays for unknown whose return was taken away: they end anywhere."""
+    if view.clear is None:
+        return view
+    return replace(view, clear=np.where((before.depth > 0) & (view.depth == 0), 0.0, view.clear))
 
 
 def _enclosed(plane: Plane, seen: Points, asked: Points) -> Chosen:
