@@ -9,19 +9,19 @@ rays end. What is behind that, as the newest view sees it, is hidden.
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from vprism_plan._shapes import Chosen, Image, Indices, Matrix, Pixels, Points, Vector
+from vprism_plan._shapes import Chosen, Indices, Matrix, Pixels, Points, Vector
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import (
     depth_sigma,
     height_sigma,
     invert_transform,
-    lift,
     project,
     transform_points,
 )
@@ -117,13 +117,19 @@ def without_old(
     Raises:
         ObservationError: a view does not say when it was taken.
     """
-    if now is None or any(view.time is None for view in earlier):
+    times = [view.time for view in earlier if view.time is not None]
+    if now is None or len(times) < len(earlier):
         raise ObservationError(
             "forget needs to know when every view was taken: give Observation(time=), seconds"
         )
-    kept, hidden = [], {}
-    for view in earlier:
-        if view.time >= now - seconds:
+    if not any(
+        t < now - seconds and (v.depth > 0).any() for t, v in zip(times, earlier, strict=True)
+    ):
+        return tuple(earlier)
+    kept: list[Observation] = []
+    hidden: dict[Any, Observation] = {}
+    for time, view in zip(times, earlier, strict=True):
+        if time >= now - seconds:
             kept.append(view)
             continue
         place = view.pose.tobytes(), view.intrinsics.tobytes(), view.shape
@@ -135,8 +141,6 @@ def without_old(
             view, depth=nothing, clear=clear, color=None, robot_spheres=None,
             labels=nothing.astype(np.int32),
         )  # fmt: skip
-    if not any((view.depth > 0).any() for view in earlier if view.time < now - seconds):
-        return tuple(earlier)
     return (*hidden.values(), *kept)
 
 
@@ -156,10 +160,8 @@ def notice(
         ObservationError: the view lies off the others, or most of what it shows contradicts.
     """
     known = [samples_of(before) for before in earlier]
-    laid, nearest, _ = lay_on(samples_of(view), known, fixed=True)
-    found = _Comparison([laid[n] for n in nearest], [known[n] for n in nearest])
-    pairs = found.where_they_were()
-    moved = {k for j, k in pairs.items() if found.disturbed(j, k) or found.shifted(j, k)}
+    found = _compared(samples_of(view), known)
+    pairs, moved = dict(found.pairs), set(found.moved)
     pairs |= found.same_number(pairs)
     elsewhere = _alike(view, earlier, found.unmatched(pairs), found.vacated(pairs))
     gone = moved | found.vacated(pairs)
@@ -196,8 +198,30 @@ def numbered(view: Observation, table: dict[int, int], earlier: int) -> Observat
     return replace(view, labels=renamed(view.labels, table), warnings=(*view.warnings, text))
 
 
+def _compared(new: Samples, known: Sequence[Samples]) -> "_Comparison":
+    """Compare a view with those before, as it is posed; or as laid on them, if that leaves fewer
+    objects that have changed: then its pose is off."""
+    as_posed = _Comparison([new] * len(known), known)
+    if not as_posed.contradicted:
+        return as_posed
+    # Where an object is that was there before, the pose is right, whatever fits better.
+    steady = len(as_posed.pairs) > len(as_posed.moved)
+    laid, nearest, _ = lay_on(new, known, fixed=True, refuse=not steady)
+    if all(samples is new for samples in laid):
+        return as_posed
+    as_laid = _Comparison([laid[n] for n in nearest], [known[n] for n in nearest])
+    return min(as_posed, as_laid, key=lambda found: found.contradicted)
+
+
 class _Comparison:
-    """Samples of a view, as laid on each of those before it, and what they say of each other."""
+    """Samples of a view, laid on each of those before it, and what they say of each other.
+
+    Attributes:
+        new, old: labels of the view, ids of those before.
+        pairs: labels whose surfaces lie where those before show one id's, and that id.
+        moved: ids of pairs that are not quite where they were.
+        contradicted: how many objects are not where they were.
+    """
 
     def __init__(self, laid: Sequence[Samples], known: Sequence[Samples]) -> None:
         self._laid, self._known = laid, known
@@ -211,24 +235,26 @@ class _Comparison:
             self._through += self._count(before.ids[back.in_front(IN_FRONT) > 0], self.old)
             self._arrived += self._count(new.ids[there.in_front(IN_FRONT) > 0], self.new)
             same, same_back = there.same(SAME), back.same(SAME)
-            for mine, theirs in (
-                (new.ids[same], there.labels[same]), (back.labels[same_back], before.ids[same_back]),
-            ):  # fmt: skip
+            both = (new.ids[same], there.labels[same])
+            for mine, theirs in (both, (back.labels[same_back], before.ids[same_back])):
                 for row, j in enumerate(self.new):
                     self._votes[row] += self._count(theirs[mine == j], self.old)
+        self.pairs = self._where_they_were()
+        self.moved = {k for j, k in self.pairs.items() if self._disturbed(j, k)}
+        news = sum(self.arrived(j) for j in self.unmatched(self.pairs))
+        self.contradicted = len(self.moved) + max(len(self.vacated(self.pairs)), news)
 
     @staticmethod
     def _count(ids: Indices, names: tuple[int, ...]) -> np.ndarray:
         return np.array([(ids == i).sum() for i in names], dtype=float)
 
     def _judged(self) -> Matrix:
-        """Samples that say whether two are one, where each is compared with all that it could be."""
+        """Samples that say whether two are one: of what is known of either, the fewer."""
         mine = self._votes.sum(axis=1) + self._arrived
         theirs = self._votes.sum(axis=0) + self._through
         return np.minimum(mine[:, None], theirs[None])
 
-    def where_they_were(self) -> dict[int, int]:
-        """Labels whose surfaces lie where an old view shows those of one id, and that id."""
+    def _where_they_were(self) -> dict[int, int]:
         rows, columns = linear_sum_assignment(-self._votes)
         enough = np.maximum(_FEWEST, _OVERLAP * self._judged())
         return {
@@ -253,18 +279,18 @@ class _Comparison:
         count = self._arrived[row]
         return bool(count >= max(_FEWEST, _SHARE * (count + self._votes[row].sum())))
 
-    def disturbed(self, j: int, k: int) -> bool:
+    def _disturbed(self, j: int, k: int) -> bool:
         """Whether an object that overlaps with what it was is not quite where it was."""
         column = self.old.index(k)
         count = self._through[column]
         gone = count >= max(_FEWEST, _SHARE * (count + self._votes[:, column].sum()))
-        return bool(gone) or self.arrived(j)
-
-    def shifted(self, j: int, k: int) -> bool:
-        """Whether its surfaces lie beside what they were."""
-        return any(
-            shift_of(new.of(new.ids == j), before.of(before.ids == k)) > NAMED_OFFSET
-            for new, before in zip(self._laid, self._known, strict=True)
+        return (
+            bool(gone)
+            or self.arrived(j)
+            or any(
+                shift_of(new.of(new.ids == j), before.of(before.ids == k)) > NAMED_OFFSET
+                for new, before in zip(self._laid, self._known, strict=True)
+            )
         )
 
     def same_number(self, pairs: dict[int, int]) -> dict[int, int]:
@@ -277,7 +303,7 @@ class _Comparison:
             theirs = np.concatenate([b.points[b.ids == j] for b in self._known])
             if len(mine[0]) and len(theirs):
                 gap, _ = cKDTree(theirs).query(mine[0])
-                if gap.min() > BESIDE:
+                if np.min(gap) > BESIDE:
                     continue
             found[j] = j
         return found
@@ -316,14 +342,11 @@ def _look(views: Sequence[Observation], label: int) -> tuple[float, Vector]:
 
 
 # -------------------------------------------------------------------------- what views are worth
-def _without(
-    before: Observation, gone: set[int], view: Observation, plane: Plane
-) -> Observation:
+def _without(before: Observation, gone: set[int], view: Observation, plane: Plane) -> Observation:
     """Return an old view without the surfaces of some ids, and of unlabelled things that a new one
     looks through; their rays stay free up to shortly before them."""
-    lost = np.isin(before.labels, sorted(gone))
-    fringe = ndimage.binary_dilation(lost, iterations=_FRINGE) & _clutter(before, plane)
-    taken = lost | fringe | _strange(before, view, plane)
+    taken = np.isin(before.labels, sorted(gone)) | _strange(before, view, plane)
+    taken |= ndimage.binary_dilation(taken, iterations=_FRINGE) & _clutter(before, plane)
     if not taken.any():
         return before
     clear = before.free_depth.copy()

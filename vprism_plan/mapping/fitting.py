@@ -237,10 +237,10 @@ def _views(observations: Any) -> tuple[Observation, ...]:
             f"got a {type(observations).__name__}; give one Observation or a list of them"
         )
     views = tuple(observations)
-    for number, view in enumerate(views):
+    for index, view in enumerate(views):
         if not isinstance(view, Observation):
             raise ObservationError(
-                f"view {number} is a {type(view).__name__}; give Observations (load_observation "
+                f"view {index} is a {type(view).__name__}; give Observations (load_observation "
                 "reads one)"
             )
     return views
@@ -272,9 +272,7 @@ def update_map(
     else:
         # Every view says where the table is, also one that no longer shows it.
         views = tuple(replace(view, plane=old.plane) for view in noticed.earlier)
-        fitted = _refitted(
-            old, (*views, numbered(mended, noticed.table, len(before))), prior
-        )
+        fitted = _refitted(old, (*views, numbered(mended, noticed.table, len(before))), prior)
     labels = observation.labels, fitted.views[-1].labels
     changes = Changes.between(
         old.object_ids, old.changes.retired, fitted.object_ids, noticed.moved, *labels

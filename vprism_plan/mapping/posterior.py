@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`VPrismMap`: the fitted posterior and the questions it answers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ class VPrismMap:
     seed: int
     warnings: tuple[str, ...] = ()
     prior: PriorField | None = None
-    changes: Changes = Changes()
+    changes: Changes = field(default_factory=Changes)
 
     def __repr__(self) -> str:
         return (

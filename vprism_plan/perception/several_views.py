@@ -38,6 +38,7 @@ IN_FRONT = 0.015  # metres, and three standard deviations
 _MOVED, _CONTRADICTS = 0.15, 0.4  # shares of samples in what another view saw to be free
 _MOST_OBJECTS = 0.7
 _OBJECT_STEPS, _OBJECT_TURN = 7, np.radians(0.5)
+_BETTER = 0.6  # share of the distance between an object's surfaces that a shift leaves
 _STILL = 1e-3  # of a pose's elements: a camera that has not moved
 
 # Laying one view on another.
@@ -179,10 +180,11 @@ def _compared(new: Samples, known: Sequence[Samples]) -> Samples:
 
 
 def lay_on(
-    new: Samples, known: Sequence[Samples], fixed: bool = False
+    new: Samples, known: Sequence[Samples], fixed: bool = False, refuse: bool = True
 ) -> tuple[list[Samples], list[int], list[tuple[float, int]]]:
     """Return a view as laid on each of those before it; the nearest ones, on which it was; and
-    how far (m) it lies off which of them. If `fixed`, a camera that has not moved is not off.
+    how far (m) it lies off which of them. If `fixed`, a camera that has not moved is not off;
+    without `refuse`, nothing is.
 
     Raises:
         ObservationError: see `agree`.
@@ -197,7 +199,9 @@ def lay_on(
         motion = explained(new, known[index])
         laid[index] = new.moved(motion.T)
         off = _is_off(motion, new.pose[:3, 3])
-        _refuse(new, laid[index], known[index], motion.offset if off else 0.0, (name, index + 1))
+        if refuse:
+            offset = motion.offset if off else 0.0
+            _refuse(new, laid[index], known[index], offset, (name, index + 1))
         if off:
             offsets.append((motion.offset, index + 1))
     return laid, nearest, offsets
@@ -289,7 +293,11 @@ def shift_of(one: Samples, other: Samples) -> float:
     if min(len(one.points), len(other.points)) < _VOTES:
         return 0.0
     motion = lay(one, other, _OBJECT_STEPS, turn=_OBJECT_TURN)  # beside the whole view's
-    return motion.offset if motion.certain(_VOTES, 1.25 * _SIGMAS) else 0.0
+    if not motion.certain(_VOTES, 1.25 * _SIGMAS):
+        return 0.0
+    # What two sides of an object have in common may leave it free to slide.
+    left = _disagreement(one.moved(motion.T), other)
+    return motion.offset if left < _BETTER * _disagreement(one, other) else 0.0
 
 
 # ---------------------------------------------------------------------------------------- ids
@@ -355,6 +363,7 @@ def _shared(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[Indices,
 
 
 def renamed(ids: np.ndarray, table: dict[int, int]) -> np.ndarray:
+    """Return ids or labels with others in their place."""
     result = ids.copy()
     for i, j in table.items():
         result[ids == i] = j
