@@ -308,7 +308,7 @@ def main() -> int:
             about = {"version": VERSION, "kind": kind, "data": scoring.data_digest(kind, None)}
             for seed in range(chosen.first_seed, chosen.first_seed + chosen.scenes):
                 for what in WHAT:
-                    asked = {**about, "seed": seed, "what": what, "camera": camera, "code": 3}
+                    asked = {**about, "seed": seed, "what": what, "camera": camera, "code": 4}
                     cases.append(Case(f"changing {kind} {seed} {what} {camera}", asked, given))
                     scenes.append(len(KINDS) * seed + KINDS.index(kind))
         found = sweep(changing_case, cases, chosen.store / "changing", jobs=chosen.jobs)

@@ -16,12 +16,13 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from vprism_plan._shapes import Chosen, Indices, Matrix, Pixels, Points, Vector
+from vprism_plan._shapes import Indices, Matrix, Pixels, Points, Vector
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import (
     depth_sigma,
     height_sigma,
     invert_transform,
+    lift,
     project,
     transform_points,
 )
@@ -34,15 +35,15 @@ from vprism_plan.perception.several_views import (
     SAME,
     Samples,
     lay_on,
-    look_up,
     renamed,
     samples_of,
     shift_of,
 )
 
-_FEWEST = 20  # samples (of 1500 on all objects) that make a contradiction
-_SHARE, _MOST = 0.15, 0.5  # of an object's judged samples: it is not quite, not at all where it was
-_OVERLAP = 0.3  # share of the judged samples that two views of one object have in common
+_EACH, _FEWEST = 300, 20  # points of an object that are looked up; that make a contradiction
+_SHARE, _MOST = 0.15, 0.5  # of its judged points: not quite, and not at all where it was
+_OVERLAP, _LEAST = 0.3, 0.1  # shares, of the judged and of all, that views of one have in common
+_TOUCHES = 0.02  # metres between what two views show of one object from its two sides
 _SIZES, _COLOURS = np.log(2.0), 0.12  # factor, and distance of chromaticities: still one object
 _AROUND = 7  # pixels: the nearest of these is what a point is in front of
 _FRINGE = 4  # pixels around a mask that are frayed
@@ -162,7 +163,7 @@ def notice(
     known = [samples_of(before) for before in earlier]
     found = _compared(samples_of(view), known)
     pairs, moved = dict(found.pairs), set(found.moved)
-    pairs |= found.same_number(pairs)
+    pairs |= found.from_another_side(pairs)
     elsewhere = _alike(view, earlier, found.unmatched(pairs), found.vacated(pairs))
     gone = moved | found.vacated(pairs)
     moved |= set(elsewhere.values())
@@ -180,9 +181,7 @@ def notice(
     if arrived.any():
         shadow, spacing = _shadow(view, arrived, plane)
         edited = tuple(_cut(before, shadow, spacing) for before in edited)
-    unchanged = all(a is b for a, b in zip(edited, earlier, strict=True))
-    # Of a scene that has not changed, `agree` knows the rest.
-    table = {j: pairs[j] for j in (news if unchanged else pairs) if pairs[j] != j}
+    table = {j: k for j, k in pairs.items() if j != k}
     return Noticed(edited, tuple(sorted(moved)), table)
 
 
@@ -204,9 +203,11 @@ def _compared(new: Samples, known: Sequence[Samples]) -> "_Comparison":
     as_posed = _Comparison([new] * len(known), known)
     if not as_posed.contradicted:
         return as_posed
-    # Where an object is that was there before, the pose is right, whatever fits better.
-    steady = len(as_posed.pairs) > len(as_posed.moved)
-    laid, nearest, _ = lay_on(new, known, fixed=True, refuse=not steady)
+    # Where objects are that were there before, the pose is right, whatever fits better.
+    steady = len(as_posed.pairs) - len(as_posed.moved)
+    if steady > len(as_posed.moved):
+        return as_posed
+    laid, nearest, _ = lay_on(new, known, fixed=True, refuse=steady == 0)
     if all(samples is new for samples in laid):
         return as_posed
     as_laid = _Comparison([laid[n] for n in nearest], [known[n] for n in nearest])
@@ -230,15 +231,22 @@ class _Comparison:
         # Rows are the new labels, columns the old ids.
         self._votes = np.zeros((len(self.new), len(self.old)))
         self._through, self._arrived = np.zeros(len(self.old)), np.zeros(len(self.new))
-        for new, before in zip(laid, known, strict=True):
-            there, back = look_up(before, new), look_up(new, before)
-            self._through += self._count(before.ids[back.in_front(IN_FRONT) > 0], self.old)
-            self._arrived += self._count(new.ids[there.in_front(IN_FRONT) > 0], self.new)
-            same, same_back = there.same(SAME), back.same(SAME)
-            both = (new.ids[same], there.labels[same])
-            for mine, theirs in (both, (back.labels[same_back], before.ids[same_back])):
-                for row, j in enumerate(self.new):
-                    self._votes[row] += self._count(theirs[mine == j], self.old)
+        self._points, self._numbers = mine, numbers = _labelled(laid[0].view)
+        self._shown = [_labelled(before.view) for before in known]
+        theirs = np.zeros(len(self.old))
+        for new, before, (points, ids) in zip(laid, known, self._shown, strict=True):
+            T = new.pose @ invert_transform(new.view.pose)
+            there = _Pixels(before.view, transform_points(T, mine))
+            back = _Pixels(new.view, transform_points(invert_transform(T), points))
+            self._arrived += self._count(numbers[there.free], self.new)
+            self._through += self._count(ids[back.free], self.old)
+            theirs += self._count(ids, self.old)
+            label = np.concatenate([numbers[there.same], back.labels[back.same]])
+            owner = np.concatenate([there.labels[there.same], ids[back.same]])
+            for row, j in enumerate(self.new):
+                self._votes[row] += self._count(owner[label == j], self.old)
+        fewer = np.minimum(self._count(numbers, self.new)[:, None], theirs[None])
+        self._enough = np.maximum(_FEWEST, np.maximum(_LEAST * fewer, _OVERLAP * self._judged()))
         self.pairs = self._where_they_were()
         self.moved = {k for j, k in self.pairs.items() if self._disturbed(j, k)}
         news = sum(self.arrived(j) for j in self.unmatched(self.pairs))
@@ -256,11 +264,10 @@ class _Comparison:
 
     def _where_they_were(self) -> dict[int, int]:
         rows, columns = linear_sum_assignment(-self._votes)
-        enough = np.maximum(_FEWEST, _OVERLAP * self._judged())
         return {
             self.new[row]: self.old[column]
             for row, column in zip(rows, columns, strict=True)
-            if self._votes[row, column] >= enough[row, column]
+            if self._votes[row, column] >= self._enough[row, column]
         }
 
     def unmatched(self, pairs: dict[int, int]) -> set[int]:
@@ -293,20 +300,61 @@ class _Comparison:
             )
         )
 
-    def same_number(self, pairs: dict[int, int]) -> dict[int, int]:
-        """Labels that are also ids, of objects that may have been seen from another side."""
-        found, away = {}, self.vacated(pairs) | set(pairs.values())
-        for j in self.unmatched(pairs) & set(self.old) - away:
-            if self.arrived(j):
-                continue
-            mine = [new.points[new.ids == j] for new in self._laid]
-            theirs = np.concatenate([b.points[b.ids == j] for b in self._known])
-            if len(mine[0]) and len(theirs):
-                gap, _ = cKDTree(theirs).query(mine[0])
-                if np.min(gap) > BESIDE:
-                    continue
-            found[j] = j
-        return found
+    def from_another_side(self, pairs: dict[int, int]) -> dict[int, int]:
+        """Labels without an id, and ids without a label, that lie side by side: one object of which
+        two views show nothing in common. The same number may lie a little farther off."""
+        mine = [j for j in sorted(self.unmatched(pairs)) if not self.arrived(j)]
+        theirs = sorted(set(self.old) - set(pairs.values()) - self.vacated(pairs))
+        cost = np.full((len(mine), len(theirs)), 1.0)
+        for column, k in enumerate(theirs):
+            tree = cKDTree(np.concatenate([p[ids == k] for p, ids in self._shown]))
+            for row, j in enumerate(mine):
+                gap = float(np.min(tree.query(self._points[self._numbers == j])[0]))
+                if gap < (BESIDE if j == k else _TOUCHES):
+                    cost[row, column] = gap - BESIDE * (j == k)
+        found = zip(*linear_sum_assignment(cost), strict=True)
+        return {mine[row]: theirs[column] for row, column in found if cost[row, column] < 1.0}
+
+
+def _labelled(view: Observation) -> tuple[Points, Indices]:
+    """Return points (m) of every object, at most some hundred of each, and their ids."""
+    labels = np.where(view.depth > 0, view.labels, 0)
+    inner = ndimage.minimum_filter(labels, 3) == ndimage.maximum_filter(labels, 3)
+    chosen = [np.zeros(0, np.int64)]
+    for k in view.object_ids:
+        own = np.flatnonzero((labels == k) & inner)  # flying pixels are at the edge
+        own = own if len(own) >= 2 * _FEWEST else np.flatnonzero(labels == k)
+        chosen.append(own[:: 1 + len(own) // _EACH])
+    row, column = np.divmod(np.concatenate(chosen), view.shape[1])
+    points = lift(view.depth, view.intrinsics, row, column)
+    return transform_points(view.pose, points), view.labels[row, column]
+
+
+class _Pixels:
+    """What a view shows at the pixels onto which some points (m) fall.
+
+    Attributes:
+        labels: of the pixels.
+        same: whether the point is of the surface that is seen there.
+        free: whether all that is seen around lies clearly behind the point, by at least so many
+            metres for each metre of depth as `slack` says.
+    """
+
+    def __init__(self, view: Observation, points: Points, slack: float = 0.0) -> None:
+        local = transform_points(invert_transform(view.pose), points)
+        pixels, z = project(local, view.intrinsics)
+        pixels[z <= _HIDDEN] = -1.0
+        column, row = np.rint(pixels).astype(np.int64).T
+        height, width = view.shape
+        hit = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        row, column = np.where(hit, row, 0), np.where(hit, column, 0)
+        shown = np.where(view.sees_robot, 0.0, view.free_depth).astype(np.float32)
+        nearest = ndimage.minimum_filter(shown, _AROUND, mode="nearest")[row, column]
+        noise = 3.0 * depth_sigma(z)
+        self.labels = np.where(hit, view.labels[row, column], 0)
+        away = np.linalg.norm(lift(view.depth, view.intrinsics, row, column) - local, axis=1)
+        self.same = hit & (view.depth[row, column] > 0) & (away < SAME + noise)
+        self.free = hit & (nearest - z > IN_FRONT + slack * z + noise)
 
 
 def _alike(
@@ -357,10 +405,15 @@ def _without(before: Observation, gone: set[int], view: Observation, plane: Plan
     )  # fmt: skip
 
 
+def _points(view: Observation, pixels: Pixels) -> Points:
+    """Points (m, world) of some pixels."""
+    return transform_points(view.pose, lift(view.depth, view.intrinsics, *np.nonzero(pixels)))
+
+
 def _clutter(view: Observation, plane: Plane) -> Pixels:
     """Pixels of unlabelled things on the support surface."""
     found = (view.labels == 0) & (view.depth > 0) & ~view.sees_robot
-    points, depth = view.point_image()[found], view.depth[found]
+    points, depth = _points(view, found), view.depth[found]
     sigma = height_sigma(points - view.camera_center, depth, plane.normal)
     found[found] = plane.signed_distance(points) > np.maximum(_CLUTTER, 4.0 * sigma)
     return found
@@ -369,29 +422,12 @@ def _clutter(view: Observation, plane: Plane) -> Pixels:
 def _strange(view: Observation, other: Observation, plane: Plane) -> Pixels:
     """Pixels of unlabelled things that stand in what another view saw to be free."""
     found = _clutter(view, plane)
-    points = view.point_image()[found]
-    found[found] = _free(other, points)
+    points = _points(view, found)
+    found[found] = _Pixels(other, points, _SLACK).free
     found = ndimage.binary_opening(found, np.ones((3, 3), dtype=bool))
     regions, count = ndimage.label(found)
     sizes = np.bincount(regions.ravel(), minlength=count + 1)
     return np.asarray(found & (sizes >= _SPECK)[regions])
-
-
-def _free(view: Observation, points: Points) -> Chosen:
-    """Which points (m) a view looked through, noise and a slight turn of its pose apart."""
-    pixels, z = project(transform_points(invert_transform(view.pose), points), view.intrinsics)
-    height, width = view.shape
-    with np.errstate(invalid="ignore"):
-        column, row = np.rint(pixels).T
-        inside = (z > 0.01) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    nearest = ndimage.minimum_filter(
-        np.where(view.sees_robot, 0.0, view.free_depth).astype(np.float32), _AROUND, mode="nearest"
-    )
-    found = np.zeros(len(points), dtype=bool)
-    at = nearest[row[inside].astype(np.int64), column[inside].astype(np.int64)]
-    margin = IN_FRONT + _SLACK * z[inside] + 3.0 * depth_sigma(z[inside])
-    found[inside] = at - z[inside] > margin
-    return found
 
 
 def _shadow(view: Observation, mask: Pixels, plane: Plane) -> tuple[Points, float]:
