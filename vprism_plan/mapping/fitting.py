@@ -113,12 +113,14 @@ def _fit(
     seed: int,
     prior: Any,
     known: Sequence[str] = (),
+    compared: bool = False,
 ) -> VPrismMap:
-    """`fit_map`; `known` are warnings of an earlier map of some of the views."""
+    """`fit_map`; `known` are warnings of an earlier map of some of the views, which may have been
+    `compared` with one another already."""
     views = _views(observations)
     if views and not any(view.labels is None or (view.labels > 0).any() for view in views):
-        return _of_empty_table(views, config, seed, known)
-    problem = learning_problem(views, config, seed)
+        return _of_empty_table(views, config, seed, known, compared)
+    problem = learning_problem(views, config, seed, compared)
     config, views, ids, plane, space = (
         problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
     )  # fmt: skip
@@ -153,11 +155,15 @@ def _fit(
 
 
 def _of_empty_table(
-    views: tuple[Observation, ...], config: MapConfig, seed: int, known: Sequence[str]
+    views: tuple[Observation, ...],
+    config: MapConfig,
+    seed: int,
+    known: Sequence[str],
+    compared: bool,
 ) -> VPrismMap:
     views = _usable(views)
     plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane)
+    views, warnings = examine(views, plane, compared=compared)
     said = (
         "no pixel has an object's label: the map has no objects, and what stands on the support "
         "surface is background, an obstacle; if objects are there, label them (segment_tabletop)"
@@ -204,16 +210,19 @@ class LearningProblem:
 
 
 def learning_problem(
-    observations: Observation | Sequence[Observation], config: MapConfig, seed: int
+    observations: Observation | Sequence[Observation],
+    config: MapConfig,
+    seed: int,
+    compared: bool = False,
 ) -> LearningProblem:
     """Return the data and features of `fit_map`, for it and for what is compared with it.
 
-    Arguments and errors are those of `fit_map`.
+    Arguments and errors are those of `fit_map`; `compared` is that of `examine`.
     """
     views = _views(observations)
     views = _usable(views)
     plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane)
+    views, warnings = examine(views, plane, compared=compared)
     object_ids = _object_ids(views) or views[0].require_objects()
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
@@ -284,7 +293,7 @@ def _refitted(old: VPrismMap, views: tuple[Observation, ...], prior: Any) -> VPr
     """Fit all views together, as the old map was."""
     logger.info("all %d views are fitted together", len(views))
     guessed = old.prior is not None or not old.object_ids
-    return _fit(views, old.config, old.seed, prior if guessed else None, old.warnings)
+    return _fit(views, old.config, old.seed, prior if guessed else None, old.warnings, True)
 
 
 def _updated(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
@@ -305,7 +314,7 @@ def _updated(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
     hinges = np.concatenate([old.space.hinges, added])
     if len(hinges) > config.max_hinges:
         logger.info("all %d views are fitted together, on a coarser lattice", len(views))
-        return _fit(views, config, old.seed, None, old.warnings)
+        return _fit(views, config, old.seed, None, old.warnings, True)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     fresh = weight_prior(space, config, old.n_classes)

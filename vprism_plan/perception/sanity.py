@@ -30,7 +30,10 @@ _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def examine(
-    views: Sequence[Observation], plane: Plane, earlier: Sequence[Observation] = ()
+    views: Sequence[Observation],
+    plane: Plane,
+    earlier: Sequence[Observation] = (),
+    compared: bool = False,
 ) -> tuple[tuple[Observation, ...], tuple[str, ...]]:
     """Return views fit for use, mended where possible, and a sentence for each thing odd in them.
 
@@ -40,6 +43,7 @@ def examine(
         views: posed as the map will have them.
         plane: support surface, world frame.
         earlier: views of the same scene that went through this before.
+        compared: whether all of them have been compared with one another already.
 
     Raises:
         ObservationError: a view that cannot be right.
@@ -50,7 +54,7 @@ def examine(
     given = views
     views = tuple(_without_what_is_behind_the_surface(view, plane) for view in views)
     views = tuple(map(_known_clear, given, mend(views, plane, len(earlier))))
-    views = agree(views, earlier)
+    views = views if compared else agree(views, earlier)
     found += [text for view in views for text in view.warnings]
     return views, tuple(dict.fromkeys(found))
 
