@@ -264,7 +264,7 @@ def _contradiction(new: Samples, known: Samples, margin: float) -> float:
 def _moved(new: Samples, known: Samples, names: tuple[str, str]) -> list[str]:
     """Name the objects that stand elsewhere in two views, or in one of them only."""
     found = []
-    remedy = "it has moved between the views; fit those since then alone"
+    remedy = "it has moved between the views; fit those since then alone, or update a map with them"
     free = _in_free_space(new, known, IN_FRONT)
     for i in np.union1d(new.ids[new.ids > 0], known.ids[known.ids > 0]).tolist():
         best = (0.0, 0.0, names)
