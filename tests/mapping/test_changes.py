@@ -319,7 +319,7 @@ def test_what_is_too_old_is_hidden_not_free():
 
 @pytest.mark.parametrize(
     ("views", "forget", "wrong"),
-    [((FIRST,), 5.0, ObservationError), ((FIRST,), -1.0, MapError), ((FIRST,), "a", MapError)],
+    [((FIRST,), 5.0, ObservationError), ((FIRST,), -1.0, MapError)],
 )
 def test_forget_needs_times_and_a_number(views, forget, wrong):
     m = vp.fit_map(dataclasses.replace(FIRST, plane=TABLE), vp.MapConfig(iterations=1))

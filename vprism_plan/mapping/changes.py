@@ -16,7 +16,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
-from vprism_plan._shapes import Indices, Matrix, Pixels, Points, Vector
+from vprism_plan._shapes import Indices, Pixels, Points, Vector
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import (
     depth_sigma,
@@ -78,7 +78,7 @@ class Changes:
     @classmethod
     def between(
         cls, before: Iterable[int], retired: Iterable[int], after: Iterable[int],
-        moved: Iterable[int], given: Indices, got: Indices,
+        moved: Iterable[int], given: np.ndarray, got: np.ndarray,
     ) -> "Changes":  # fmt: skip
         """Return what the ids of two maps say, those of objects that moved, and the labels of the
         newest view as they were given and as they are."""
@@ -256,7 +256,7 @@ class _Comparison:
     def _count(ids: Indices, names: tuple[int, ...]) -> np.ndarray:
         return np.array([(ids == i).sum() for i in names], dtype=float)
 
-    def _judged(self) -> Matrix:
+    def _judged(self) -> np.ndarray:
         """Samples that say whether two are one: of what is known of either, the fewer."""
         mine = self._votes.sum(axis=1) + self._arrived
         theirs = self._votes.sum(axis=0) + self._through

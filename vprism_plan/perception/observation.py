@@ -68,7 +68,7 @@ class Observation:
     robot_spheres: Any = None
     warnings: tuple[str, ...] = ()
     max_range: float = DEFAULT_MAX_RANGE
-    time: float | None = None
+    time: Any = None
     clear: Any = None
     background_ids: InitVar[Any] = ()
 
