@@ -253,7 +253,7 @@ def _cell(value: dict[str, float] | None) -> str:
         return "-"
     if value["low"] is None:
         return f"{100 * value['value']:.3g}"
-    return f"{100 * value['value']:.3g} [{100 * value['low']:.2g}, {100 * value['high']:.2g}]"
+    return f"{100 * value['value']:.3g} [{100 * value['low']:.3g}, {100 * value['high']:.3g}]"
 
 
 def _page(whole: dict[str, Any], command: str) -> str:
@@ -276,9 +276,17 @@ def _page(whole: dict[str, Any], command: str) -> str:
             if not own["cases"]:
                 continue
             cells = [_cell(own[k]) for k in ("stale", "stale_seen", "missed", "free")]
-            more = [_cell(own.get("ids")), "{} of {}".format(*own.get("reported", ("-", "-")))]
+            more = [
+                _cell(own.get("ids")),
+                "{} of {}".format(*own["reported"]) if "reported" in own else "-",
+            ]
             refused = f"{own['refused']} of {own['cases']}"
             lines.append("| " + " | ".join([CAMERAS[camera], name, *cells, *more, refused]) + " |")
+    lines += [
+        "",
+        "From the same camera most of the new volume is hidden: what an update misses there, the "
+        "second view alone misses as well, and none of it because an old view called it free.",
+    ]  # fmt: skip
     return "\n".join([*lines, "", "![Stale and missed volume](changing.png)", ""])
 
 
