@@ -284,8 +284,8 @@ def _page(whole: dict[str, Any], command: str) -> str:
             lines.append("| " + " | ".join([CAMERAS[camera], name, *cells, *more, refused]) + " |")
     lines += [
         "",
-        "From the same camera most of the new volume is hidden: what an update misses there, the "
-        "second view alone misses as well, and none of it because an old view called it free.",
+        "What an update misses is to be read beside what the second view alone misses: a guess of "
+        "the hidden side that is too small. The column after it is what an old view would add.",
     ]  # fmt: skip
     return "\n".join([*lines, "", "![Stale and missed volume](changing.png)", ""])
 
