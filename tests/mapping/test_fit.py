@@ -215,10 +215,15 @@ def test_an_empty_table_is_a_map_that_says_so(scene, tmp_path):
     again = load_map(tmp_path / "map.safetensors")
     assert (again.object_ids, again.warnings) == (fitted.object_ids, fitted.warnings)
     assert again.plane.offset == fitted.plane.offset
-    # What is seen later enters, and a later view in which nothing is left takes nothing away.
-    later = fitted.update(scene.observation)
-    assert later.object_ids == scene.observation.object_ids
-    assert later.update(empty).object_ids == later.object_ids
+    # What is seen later enters. A view without labels takes nothing away that still stands there,
+    # but what it looks through.
+    seen = scene.observation
+    later = fitted.update(seen)
+    assert later.object_ids == seen.object_ids
+    unlabelled = Observation(seen.depth, nothing, seen.intrinsics, seen.pose)
+    assert later.update(unlabelled).object_ids == later.object_ids
+    gone = later.update(empty)
+    assert (gone.object_ids, gone.changes.left) == ((), seen.object_ids)
 
 
 def test_labels_of_which_none_is_an_object_are_refused():

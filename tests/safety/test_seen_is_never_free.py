@@ -136,3 +136,38 @@ def test_farther_than_was_judged_is_refused_and_says_so(ball):
     (contact,) = checker.explain([0.0, -4.9, 0.5]).contacts
     assert contact.kind == "unobserved"
     assert "bounds" in contact.detail
+
+
+def _box(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    size, at = rng.uniform(0.03, 0.1, 3), rng.uniform(-0.15, 0.15, 2)
+    low = np.array([*(at - size[:2] / 2), 0.0])
+    return low, low + size
+
+
+@pytest.mark.parametrize("seed", [0, *map(slow, range(1, 8))])
+def test_nothing_that_the_newest_view_of_a_changing_table_shows_is_accepted(seed, ball):
+    rng = np.random.default_rng(seed)
+    boxes = {k: _box(rng) for k in (1, 2, 3, 4)}
+    plane, map_ = vp.perception.Plane((0.0, 0.0, 1.0), 0.0), None
+    for step in range(4):
+        if step:  # one has left, one has moved, one has come
+            rest = rng.permutation([*boxes])[1:].tolist()
+            boxes = {k: boxes[k] for k in rest} | {rest[0]: _box(rng), 10 + step: _box(rng)}
+        eye = (-0.75, 0.0, 0.65) if rng.random() < 0.5 else (*rng.uniform(-0.6, 0.6, 2), 0.75)
+        pose = look_at(eye, (0.0, 0.0, 0.03))
+        depth, labels = Scene(boxes=list(boxes.values()), table=((-1.0, -1.0), (1.0, 1.0))).render(
+            pose, K
+        )
+        sigma = depth_sigma(np.where(depth > 0, depth, 1.0))
+        depth = np.where(depth > 0, depth + 0.3 * sigma * rng.standard_normal(depth.shape), 0.0)
+        labels = np.array([0, *rng.permutation(len(boxes)) + 1])[labels]
+        view = vp.Observation(depth, labels, K, pose, plane=plane)
+        if map_ is None:
+            map_ = vp.fit_map(view)
+            continue
+        map_ = map_.update(view)
+        points = seen_points(map_.views[-1], step)  # whose masks are mended
+        config = vp.CheckerConfig(max_risk=0.9, n_worlds=64)
+        world = vp.World(map_, vp.WorldConfig(0.01, bounds=SMALL))
+        accepted = vp.CollisionChecker(world, ball, config).is_valid_batch(points)
+        assert not accepted.any(), (step, map_.changes, points[accepted][:3])

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int64
+from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
-from vprism_plan._arguments import choice, is_whole
+from vprism_plan._arguments import choice, is_whole, number
 from vprism_plan._shapes import Indices, Points
 from vprism_plan.errors import MapError, ObservationError
+from vprism_plan.mapping.changes import Changes, notice, numbered, without_old
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import (
     Posterior,
@@ -45,6 +46,7 @@ from vprism_plan.mapping.training_data import (
     stray_points,
     sunk_objects,
 )
+from vprism_plan.perception.camera import point_image
 from vprism_plan.perception.masks import drop_background
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
@@ -111,12 +113,14 @@ def _fit(
     seed: int,
     prior: Any,
     known: Sequence[str] = (),
+    compared: bool = False,
 ) -> VPrismMap:
-    """`fit_map`; `known` are warnings of an earlier map of some of the views."""
+    """`fit_map`; `known` are warnings of an earlier map of some of the views, which may have been
+    `compared` with one another already."""
     views = _views(observations)
     if views and not any(view.labels is None or (view.labels > 0).any() for view in views):
-        return _of_empty_table(views, config, seed, known)
-    problem = learning_problem(views, config, seed)
+        return _of_empty_table(views, config, seed, known, compared)
+    problem = learning_problem(views, config, seed, compared)
     config, views, ids, plane, space = (
         problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
     )  # fmt: skip
@@ -151,11 +155,15 @@ def _fit(
 
 
 def _of_empty_table(
-    views: tuple[Observation, ...], config: MapConfig, seed: int, known: Sequence[str]
+    views: tuple[Observation, ...],
+    config: MapConfig,
+    seed: int,
+    known: Sequence[str],
+    compared: bool,
 ) -> VPrismMap:
     views = _usable(views)
     plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane)
+    views, warnings = examine(views, plane, compared=compared)
     said = (
         "no pixel has an object's label: the map has no objects, and what stands on the support "
         "surface is background, an obstacle; if objects are there, label them (segment_tabletop)"
@@ -202,16 +210,19 @@ class LearningProblem:
 
 
 def learning_problem(
-    observations: Observation | Sequence[Observation], config: MapConfig, seed: int
+    observations: Observation | Sequence[Observation],
+    config: MapConfig,
+    seed: int,
+    compared: bool = False,
 ) -> LearningProblem:
     """Return the data and features of `fit_map`, for it and for what is compared with it.
 
-    Arguments and errors are those of `fit_map`.
+    Arguments and errors are those of `fit_map`; `compared` is that of `examine`.
     """
     views = _views(observations)
     views = _usable(views)
     plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane)
+    views, warnings = examine(views, plane, compared=compared)
     object_ids = _object_ids(views) or views[0].require_objects()
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
@@ -235,33 +246,64 @@ def _views(observations: Any) -> tuple[Observation, ...]:
             f"got a {type(observations).__name__}; give one Observation or a list of them"
         )
     views = tuple(observations)
-    for number, view in enumerate(views):
+    for index, view in enumerate(views):
         if not isinstance(view, Observation):
             raise ObservationError(
-                f"view {number} is a {type(view).__name__}; give Observations (load_observation "
+                f"view {index} is a {type(view).__name__}; give Observations (load_observation "
                 "reads one)"
             )
     return views
 
 
-def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
+def update_map(
+    old: VPrismMap, observation: Observation, prior: Any, forget: float | None
+) -> VPrismMap:
     """See `VPrismMap.update`."""
     if not isinstance(observation, Observation):
         raise ObservationError(f"update got a {type(observation).__name__}; give one Observation")
-    config, plane = old.config, old.plane
-    (observation,) = _usable((observation,), old.views)
-    (observation,), found = examine((observation,), plane, old.views)
-    seen = _object_ids((observation,))
-    views = (*old.views, observation)
     if old.prior is not None and old.prior.own and isinstance(prior, str):
         raise MapError(
             "this map's prior is one of your own; give it again: update(view, prior=...), or "
             "fit_map to ask the package's"
         )
+    (observation,) = _usable((observation,), old.views)
+    if not old.views:
+        return _refitted(old, (observation,), prior)
+    before = old.views
+    if forget is not None:
+        seconds = number("forget", forget, 0.0, unit="seconds", error=MapError)
+        before = without_old(before, observation.time, seconds)
+    (mended,), _ = examine((observation,), old.plane)
+    noticed = notice(mended, before, old.plane, old.changes.retired)
+    same = len(noticed.earlier) == len(old.views)
+    if same and all(a is b for a, b in zip(noticed.earlier, old.views, strict=True)):
+        fitted = _updated(old, numbered(observation, noticed.table, len(before)), prior)
+    else:
+        # Every view says where the table is, also one that no longer shows it.
+        views = tuple(replace(view, plane=old.plane) for view in noticed.earlier)
+        fitted = _refitted(old, (*views, numbered(mended, noticed.table, len(before))), prior)
+    labels = observation.labels, fitted.views[-1].labels
+    changes = Changes.between(
+        old.object_ids, old.changes.retired, fitted.object_ids, noticed.moved, *labels
+    )
+    return replace(fitted, changes=changes)
+
+
+def _refitted(old: VPrismMap, views: tuple[Observation, ...], prior: Any) -> VPrismMap:
+    """Fit all views together, as the old map was."""
+    logger.info("all %d views are fitted together", len(views))
+    guessed = old.prior is not None or not old.object_ids
+    return _fit(views, old.config, old.seed, prior if guessed else None, old.warnings, True)
+
+
+def _updated(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
+    """Fit one more view of the scene as it was."""
+    config, plane = old.config, old.plane
+    (observation,), found = examine((observation,), plane, old.views)
+    seen = _object_ids((observation,))
+    views = (*old.views, observation)
     if old.prior is not None or not seen or not set(seen) <= set(old.object_ids):
-        logger.info("all %d views are fitted together", len(views))
-        guessed = old.prior is not None or not old.object_ids
-        return _fit(views, config, old.seed, prior if guessed else None, old.warnings)
+        return _refitted(old, views, prior)
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
@@ -272,7 +314,7 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     hinges = np.concatenate([old.space.hinges, added])
     if len(hinges) > config.max_hinges:
         logger.info("all %d views are fitted together, on a coarser lattice", len(views))
-        return _fit(views, config, old.seed, None, old.warnings)
+        return _fit(views, config, old.seed, None, old.warnings, True)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     fresh = weight_prior(space, config, old.n_classes)
@@ -292,22 +334,23 @@ def training_data(
 ) -> TrainingData:
     """Observed points, negative samples and their subsampling (section V)."""
     clouds = [_without_strays(*_marked_points(view), config.stray_share) for view in views]
-    points = np.concatenate([cloud for cloud, _ in clouds])
-    labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
+    points = np.concatenate([cloud for cloud, _, _ in clouds])
+    labels = np.concatenate([label for _, label, _ in clouds]).astype(np.int64)
     lower, upper = box_centers(points, labels, object_ids, config.box_trim)
     centers = 0.5 * (lower + upper)
     empty = [points[labels == 0]]
     front: list[np.ndarray] = []
-    for view, (cloud, label) in zip(views, clouds, strict=True):
+    for view, (cloud, label, ends) in zip(views, clouds, strict=True):
         origin = view.camera_center
         empty.append(
             sample_rays(
-                cloud, origin, centers, config.object_radius, config.ray_step, rng,
+                ends, origin, centers, config.object_radius, config.ray_step, rng,
                 config.ray_sampling,
             )
         )  # fmt: skip
         if config.front_distance is not None:
-            seen = sample_in_front(cloud[label > 0], origin, config.front_distance)
+            whole = (ends == cloud).all(axis=1)
+            seen = sample_in_front(cloud[(label > 0) & whole], origin, config.front_distance)
             front.append(grid_subsample(seen, config.front_resolution))
     below = sample_below_plane(
         plane.normal, plane.offset, centers, config.object_radius,
@@ -336,18 +379,30 @@ def training_data(
     )
 
 
-def _marked_points(view: Observation) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """One view's points and labels, -1 where it sees the robot.
+def _marked_points(view: Observation) -> tuple[Points, Indices, Points]:
+    """One view's points and labels, -1 where it sees the robot, and where its free rays end.
 
     The ray before such a point is as empty as any other. The point itself says nothing:
-    if it should belong to what the robot holds, calling it empty would carve that away.
+    if it should belong to what the robot holds, calling it empty would carve that away. So it
+    is with what has gone, and with empty places behind what has come since.
     """
     points, labels = view.points()
-    return points, np.where(view.sees_robot[view.depth > 0], -1, labels)
+    labels = np.where(view.sees_robot[view.depth > 0], -1, labels)
+    if view.clear is None:
+        return points, labels, points
+    kept, gone = view.depth > 0, (view.depth == 0) & (view.clear > 0)
+    image = point_image(view.clear, view.intrinsics, view.pose)
+    cut = (view.clear < view.depth)[kept]
+    ends = np.where(cut[:, None], image[kept], points)
+    ends = np.where((view.clear > 0)[kept][:, None], ends, view.camera_center)
+    labels = np.concatenate([np.where(cut & (labels == 0), -1, labels), np.full(gone.sum(), -1)])
+    return np.concatenate([points, image[gone]]), labels, np.concatenate([ends, image[gone]])
 
 
-def _without_strays(points: Points, labels: Indices, share: float) -> tuple[Points, Indices]:
-    """Return one view's points and labels without flying pixels.
+def _without_strays(
+    points: Points, labels: Indices, ends: Points, share: float
+) -> tuple[Points, Indices, Points]:
+    """Return one view's points, labels and ends of rays without flying pixels.
 
     Their rays go as well: they end in the shadow of what they fringe, and samples along
     them would call that shadow empty.
@@ -358,7 +413,7 @@ def _without_strays(points: Points, labels: Indices, share: float) -> tuple[Poin
         keep[own] = ~stray_points(points[own], share)
     if not keep.all():
         logger.info("%d of %d points taken for flying pixels", (~keep).sum(), len(keep))
-    return points[keep], labels[keep]
+    return points[keep], labels[keep], ends[keep]
 
 
 def new_hinges(

@@ -155,4 +155,4 @@ def _depth_behind(view: Observation, plane: Plane) -> Float[np.ndarray, "h w"]:
     valid = depth > 0.0
     bare = (labels == 0) & ~view.sees_robot[valid] & (plane.signed_distance(points) < _ON_PLANE)
     depth[valid] = np.where(bare, np.inf, depth[valid])
-    return depth
+    return depth if view.clear is None else np.where(view.clear == view.depth, depth, view.clear)

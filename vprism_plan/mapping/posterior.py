@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """`VPrismMap`: the fitted posterior and the questions it answers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from vprism_plan._shapes import Points, Values
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping import prediction
+from vprism_plan.mapping.changes import Changes
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior, Weights, diagonal_prior
 from vprism_plan.mapping.factors import correlate, dense, run_per_class
@@ -48,6 +49,7 @@ class VPrismMap:
         posterior: Gaussian posterior of the weights (hinges in `space` order).
         space: sorted hinge points and kernel.
         prior: what is added to the kernels' logits: a guess of the hidden side, or None.
+        changes: what the last `update` noticed of objects that moved, left or came.
     """
 
     config: MapConfig
@@ -59,6 +61,7 @@ class VPrismMap:
     seed: int
     warnings: tuple[str, ...] = ()
     prior: PriorField | None = None
+    changes: Changes = field(default_factory=Changes)
 
     def __repr__(self) -> str:
         return (
@@ -239,8 +242,22 @@ class VPrismMap:
         return out
 
     # ------------------------------------------------------------------ learning, files
-    def update(self, observation: Observation, prior: Any = "shape") -> "VPrismMap":
+    def update(
+        self, observation: Observation, prior: Any = "shape", forget: float | None = None
+    ) -> "VPrismMap":
         """Return a new map that has also seen `observation` (labelled, in the same world frame).
+
+        Where it contradicts the views before, it is right, and they are of another time: objects
+        that are seen not to be where they were are taken out of them, and their rays end before
+        what has come since; what that hides from the new view is hidden. `changes` says which
+        objects moved, left and came. Labels are matched by place, and by size and colour of what
+        moved; new objects whose label is another's id get one of their own.
+
+        Args:
+            observation: the newest view.
+            prior: see below.
+            forget: seconds after which evidence is too old: it goes, and its place is hidden. Every
+                view needs a `time`.
 
         Without a prior of the hidden side the old posterior is the prior of the new one; hinge
         points for ground the old map did not reach enter with the configured prior. If the view
@@ -249,12 +266,13 @@ class VPrismMap:
         own has to be given again.
 
         Raises:
-            ObservationError: the view has no labels or no objects.
+            ObservationError: the view has no labels or no objects, lies off the others by more
+                than 5 cm, or a time is missing.
             MapError: the map was made with a prior of your own, and it is not given.
         """
         from vprism_plan.mapping.fitting import update_map
 
-        return update_map(self, observation, prior)
+        return update_map(self, observation, prior, forget)
 
     def save(self, path: str | Path) -> None:
         """Write the map, views included, to a safetensors file; complete or not at all."""

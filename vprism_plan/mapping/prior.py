@@ -354,7 +354,7 @@ def hidden_depth(points: Points, views: Sequence[Observation], window: int = 1) 
         with np.errstate(invalid="ignore"):
             column, row = np.rint(pixels).T
             inside = (z > 0.0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        seen = view.depth if window == 1 else minimum_filter(view.depth, window)
+        seen = view.free_depth if window == 1 else minimum_filter(view.free_depth, window)
         depth = np.zeros(len(points))
         depth[inside] = seen[row[inside].astype(np.int64), column[inside].astype(np.int64)]
         known = depth > 0.0

@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 from vprism_plan._arguments import is_whole
 from vprism_plan._files import reading, replacing
 from vprism_plan.errors import ConfigError, MapError, ObservationError
+from vprism_plan.mapping.changes import Changes
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import Posterior, Weights
 from vprism_plan.mapping.factors import inverse, run_per_class
@@ -40,7 +41,7 @@ FORMAT_VERSION = 4
 _HEADER = "vprism_plan"
 _DIGEST = "sha256"
 _NEEDED_PARTS = ("depth", "labels", "intrinsics")
-_VIEW_PARTS = (*_NEEDED_PARTS, "T_world_camera", "color", "robot_spheres")
+_VIEW_PARTS = (*_NEEDED_PARTS, "T_world_camera", "color", "robot_spheres", "clear")
 _PRIOR = tuple(field.name for field in fields(PriorField) if field.name != "own")
 _FARTHEST = 1e6  # metres; kernels count cells up to the farthest hinge
 
@@ -75,6 +76,8 @@ def save_map(fitted: "VPrismMap", path: str | Path) -> None:
         "seed": fitted.seed,
         "views": len(fitted.views),
         "max_range": [view.max_range for view in fitted.views],
+        "time": [view.time for view in fitted.views],
+        "changes": asdict(fitted.changes),
         "warnings": list(fitted.warnings),
         "radius": float(fitted.space.radius).hex(),
         "own_prior": prior is not None and prior.own,
@@ -157,14 +160,26 @@ def _restored(meta: dict[str, Any], tensors: dict[str, np.ndarray]) -> "VPrismMa
     _check_hinges(space, config, len(tensors["class0.precision"]))
     posterior = _posterior(tensors, space, len(object_ids) + 1)
     views = _views(tensors, meta["views"], meta["max_range"], len(object_ids) + 1)
+    times = meta.get("time", [None] * len(views))  # files of before have none, and no changes
+    views = tuple(replace(view, time=t) for view, t in zip(views, times, strict=True))
     _check_labels(views, object_ids)
     plane, warnings = _plane(tensors["plane"]), tuple(meta["warnings"])
     if not all(isinstance(text, str) for text in warnings):
         raise MapError("warnings must be sentences")
     prior = _prior(tensors, len(object_ids), meta["own_prior"])
     return VPrismMap(
-        config, object_ids, plane, views, space, posterior, meta["seed"], warnings, prior
-    )
+        config, object_ids, plane, views, space, posterior, meta["seed"], warnings, prior,
+        _changes(meta.get("changes", {})),
+    )  # fmt: skip
+
+
+def _changes(meta: Any) -> Changes:
+    """Return what the last update noticed."""
+    found = {name: tuple(map(tuple, v) if name == "ids" else v) for name, v in meta.items()}
+    flat = [i for name, v in found.items() for i in (sum(v, ()) if name == "ids" else v)]
+    if not all(is_whole(i) and i > 0 for i in flat):
+        raise MapError(f"changes are {meta}; they must be ids")
+    return Changes(**found)
 
 
 def _prior(tensors: Mapping[str, np.ndarray], objects: int, own: Any) -> PriorField | None:

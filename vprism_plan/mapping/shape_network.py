@@ -70,8 +70,10 @@ def crop_features(
         r = np.where(inside, row, 0).astype(np.int64)
         c = np.where(inside, column, 0).astype(np.int64)
         depth, label = view.depth[r, c], labels[r, c]
-        valid = inside & (depth > 0.0)
-        way = (depth - local[:, 2]) * np.linalg.norm(local, axis=1) / z / crop.voxel
+        free = view.free_depth[r, c]
+        # Beyond what is still known to be free, the label is of what was there before.
+        valid = inside & (depth > 0.0) & ((free == depth) | (free > local[:, 2]))
+        way = (free - local[:, 2]) * np.linalg.norm(local, axis=1) / z / crop.voxel
         # A ray without a return says nothing of the way: worse than any view that has one.
         way = np.where(valid, way, np.where(inside, -1e6, -np.inf))
         wins = way > best

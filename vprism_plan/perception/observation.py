@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int32
 
 from vprism_plan._arguments import number, rigid_pose
-from vprism_plan._shapes import Pixels, PointImage, Points, Pose, Vector
+from vprism_plan._shapes import Image, Pixels, PointImage, Points, Pose, Vector
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import backproject, point_image, within_balls
 from vprism_plan.perception.labels import label_image, to_numpy
@@ -49,6 +49,10 @@ class Observation:
             handed on to the map, the world and every verdict.
         max_range: metres of depth beyond which a return is none: what lies there is a driver's
             value for "no data", or a mirror, and must not make all before it free.
+        time: seconds of any clock, when the image was taken; None = nobody said.
+        clear: (H, W) metres of optical axis to which a ray is still known to be free, 0 = nowhere;
+            None = up to `depth`. Updates set it in views of a scene that has changed since:
+            where `depth` is 0 the surface has gone, and what lies beyond `clear` is hidden.
         background_ids: only given: ids among `labels` that are no object; they become 0.
 
     Raises:
@@ -64,11 +68,13 @@ class Observation:
     robot_spheres: Any = None
     warnings: tuple[str, ...] = ()
     max_range: float = DEFAULT_MAX_RANGE
+    time: Any = None
+    clear: Any = None
     background_ids: InitVar[Any] = ()
 
     def __post_init__(self, background_ids: Any) -> None:
         max_range = number("max_range", self.max_range, 0.0, above=True, error=ObservationError)
-        depth, found = check_depth(self.depth, max_range)
+        depth, found = check_depth(self.depth, max_range, empty=self.clear is not None)
         checked: dict[str, Any] = {
             "max_range": max_range,
             "depth": depth,
@@ -86,6 +92,10 @@ class Observation:
             raise ObservationError(f"plane is a {type(self.plane).__name__}; give a Plane or None")
         if self.robot_spheres is not None:
             checked["robot_spheres"] = check_robot_spheres(self.robot_spheres)
+        if self.time is not None:
+            checked["time"] = number("time", self.time, unit="seconds", error=ObservationError)
+        if self.clear is not None:
+            checked["clear"] = check_clear(self.clear, depth.shape)
         checked["warnings"] = tuple(dict.fromkeys([*map(str, self.warnings), *found]))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -144,6 +154,11 @@ class Observation:
     def camera_center(self) -> Vector:
         """Optical centre in the world frame, metres."""
         return self.pose[:3, 3]
+
+    @property
+    def free_depth(self) -> Image:
+        """(H, W) metres of optical axis up to which a ray is free, 0 = nowhere."""
+        return np.asarray(self.depth if self.clear is None else self.clear)
 
     @cached_property
     def sees_robot(self) -> Pixels:
@@ -206,7 +221,9 @@ class Observation:
 
 
 # ------------------------------------------------------------------------------------- checks
-def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ...]]:
+def check_depth(
+    value: Any, max_range: float, empty: bool = False
+) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return depth as a (H, W) float32 or float64 array in metres, 0 = no return.
 
     NaN, infinities and what lies beyond `max_range` (metres) are no returns. Named in the second
@@ -239,7 +256,8 @@ def check_depth(value: Any, max_range: float) -> tuple[np.ndarray, tuple[str, ..
         )
     depth[near | ~(depth < _INFINITE)] = 0.0  # NaN compares false
     valid = depth[depth > 0]
-    _check_scale(valid, max_range)
+    if len(valid) or not empty:
+        _check_scale(valid, max_range)
     beyond = depth > max_range
     depth = np.ascontiguousarray(depth)
     if not beyond.any():
@@ -313,6 +331,15 @@ def check_pose(value: Any) -> Float[np.ndarray, "4 4"]:
         u, _, vt = np.linalg.svd(rotation)
         pose[:3, :3] = u @ vt
     return pose
+
+
+def check_clear(value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a (H, W) float image of the depth's shape, metres."""
+    clear = to_numpy(value, "clear")
+    if clear.shape != shape or clear.dtype.kind != "f" or not (clear >= 0.0).all():
+        found = f"clear has shape {clear.shape} and type {clear.dtype}, or holds NaN or what is < 0"
+        raise ObservationError(f"{found}; it must be metres, {shape}")
+    return np.ascontiguousarray(clear)
 
 
 def check_color(value: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -30,7 +30,10 @@ _Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
 def examine(
-    views: Sequence[Observation], plane: Plane, earlier: Sequence[Observation] = ()
+    views: Sequence[Observation],
+    plane: Plane,
+    earlier: Sequence[Observation] = (),
+    compared: bool = False,
 ) -> tuple[tuple[Observation, ...], tuple[str, ...]]:
     """Return views fit for use, mended where possible, and a sentence for each thing odd in them.
 
@@ -40,6 +43,7 @@ def examine(
         views: posed as the map will have them.
         plane: support surface, world frame.
         earlier: views of the same scene that went through this before.
+        compared: whether all of them have been compared with one another already.
 
     Raises:
         ObservationError: a view that cannot be right.
@@ -47,8 +51,10 @@ def examine(
     found: list[str] = []
     for view in views:
         found += [*_pose(view, plane), *_lens(view), *_bend(view, plane), *_sizes(view)]
+    given = views
     views = tuple(_without_what_is_behind_the_surface(view, plane) for view in views)
-    views = agree(mend(views, plane, len(earlier)), earlier)
+    views = tuple(map(_known_clear, given, mend(views, plane, len(earlier))))
+    views = views if compared else agree(views, earlier)
     found += [text for view in views for text in view.warnings]
     return views, tuple(dict.fromkeys(found))
 
@@ -183,6 +189,13 @@ def _without_what_is_behind_the_surface(view: Observation, plane: Plane) -> Obse
         "support surface, through what was seen of it: a mirror or glass? They count as no return"
     )
     return replace(view, depth=np.where(below, 0.0, view.depth), warnings=(*view.warnings, text))
+
+
+def _known_clear(before: Observation, view: Observation) -> Observation:
+    """Take rays for unknown whose return was taken away: they end anywhere."""
+    if view.clear is None:
+        return view
+    return replace(view, clear=np.where((before.depth > 0) & (view.depth == 0), 0.0, view.clear))
 
 
 def _enclosed(plane: Plane, seen: Points, asked: Points) -> Chosen:

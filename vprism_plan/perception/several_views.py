@@ -31,13 +31,15 @@ TOLERATED_TURN = np.radians(1.5)
 _NEAREST_VIEWS = 3  # that a view is laid on; more say nothing new
 _FEWEST, _SIGMAS = 200, 4.0  # pairs of samples, below which nothing is said
 
-_SAME = 0.01  # metres between points of one surface
+SAME = 0.01  # metres between points of one surface
 _VOTES, _CLEAR, _AGREES = 50, 0.7, 0.3
-_BESIDE = 0.05  # metres between what may be one object
-_IN_FRONT = 0.015  # metres, and three standard deviations
+BESIDE = 0.05  # metres between what may be one object
+IN_FRONT = 0.015  # metres, and three standard deviations
 _MOVED, _CONTRADICTS = 0.15, 0.4  # shares of samples in what another view saw to be free
 _MOST_OBJECTS = 0.7
 _OBJECT_STEPS, _OBJECT_TURN = 7, np.radians(0.5)
+_BETTER = 0.6  # share of the distance between an object's surfaces that a shift leaves
+_STILL = 1e-3  # of a pose's elements: a camera that has not moved
 
 # Laying one view on another.
 _OBJECT_SAMPLES, _OTHER_SAMPLES = 1500, 700  # pixels on smooth surfaces
@@ -157,20 +159,11 @@ def agree(
 def _compared(new: Samples, known: Sequence[Samples]) -> Samples:
     """Compare a view with those before it; the numbers of views count from 1."""
     name, found = f"view {len(known) + 1}", []
-    distance = [np.linalg.norm(new.pose[:3, 3] - k.pose[:3, 3]) for k in known]
-    nearest = sorted(np.argsort(distance, kind="stable")[:_NEAREST_VIEWS].tolist())
-    laid, offsets = [new] * len(known), []
-    for index in nearest:
-        motion = explained(new, known[index])
-        laid[index] = new.moved(motion.T)
-        off = _is_off(motion, new.pose[:3, 3])
-        _refuse(new, laid[index], known[index], motion.offset if off else 0.0, (name, index + 1))
-        if off:
-            offsets.append((motion.offset, index + 1))
+    laid, nearest, offsets = lay_on(new, known)
     table, text = _other_ids(laid, known)
     found += [f"{name} {text}"] if text else []
     if table:
-        labels, ids = _renamed(new.view.labels, table), _renamed(new.ids, table)
+        labels, ids = renamed(new.view.labels, table), renamed(new.ids, table)
         new = replace(new, view=replace(new.view, labels=labels), ids=ids)
         laid = [replace(samples, ids=ids) for samples in laid]
     if offsets:
@@ -184,6 +177,34 @@ def _compared(new: Samples, known: Sequence[Samples]) -> Samples:
         found += _moved(laid[index], known[index], (name, f"view {index + 1}"))
     said = tuple(dict.fromkeys([*new.view.warnings, *found]))
     return replace(new, view=replace(new.view, warnings=said)) if found else new
+
+
+def lay_on(
+    new: Samples, known: Sequence[Samples], fixed: bool = False, refuse: bool = True
+) -> tuple[list[Samples], list[int], list[tuple[float, int]]]:
+    """Return a view as laid on each of those before it; the nearest ones, on which it was; and
+    how far (m) it lies off which of them. If `fixed`, a camera that has not moved is not off;
+    without `refuse`, nothing is.
+
+    Raises:
+        ObservationError: see `agree`.
+    """
+    name = f"view {len(known) + 1}"
+    distance = [np.linalg.norm(new.pose[:3, 3] - k.pose[:3, 3]) for k in known]
+    nearest = sorted(np.argsort(distance, kind="stable")[:_NEAREST_VIEWS].tolist())
+    laid, offsets = [new] * len(known), []
+    for index in nearest:
+        if fixed and np.abs(new.pose - known[index].pose).max() < _STILL:
+            continue
+        motion = explained(new, known[index])
+        laid[index] = new.moved(motion.T)
+        off = _is_off(motion, new.pose[:3, 3])
+        if refuse:
+            offset = motion.offset if off else 0.0
+            _refuse(new, laid[index], known[index], offset, (name, index + 1))
+        if off:
+            offsets.append((motion.offset, index + 1))
+    return laid, nearest, offsets
 
 
 def _is_off(motion: Motion, camera: Vector) -> bool:
@@ -215,7 +236,7 @@ def _refuse(
             f"than {1e3 * REFUSED_OFFSET:.0f} mm: {remedy}"
         )
     share = _contradiction(laid, known, REFUSED_OFFSET)
-    if share <= _CONTRADICTS and _contradiction(laid, known, _IN_FRONT) > _CONTRADICTS:
+    if share <= _CONTRADICTS and _contradiction(laid, known, IN_FRONT) > _CONTRADICTS:
         # The motion found does not explain it either.
         share = _contradiction(new, known, REFUSED_OFFSET)
     if share > _CONTRADICTS:
@@ -243,8 +264,8 @@ def _contradiction(new: Samples, known: Samples, margin: float) -> float:
 def _moved(new: Samples, known: Samples, names: tuple[str, str]) -> list[str]:
     """Name the objects that stand elsewhere in two views, or in one of them only."""
     found = []
-    remedy = "it has moved between the views; fit those since then alone"
-    free = _in_free_space(new, known, _IN_FRONT)
+    remedy = "it has moved between the views; fit those since then alone, or update a map with them"
+    free = _in_free_space(new, known, IN_FRONT)
     for i in np.union1d(new.ids[new.ids > 0], known.ids[known.ids > 0]).tolist():
         best = (0.0, 0.0, names)
         for (ids, ahead), order in zip(free, (names, names[::-1]), strict=True):
@@ -258,16 +279,25 @@ def _moved(new: Samples, known: Samples, names: tuple[str, str]) -> list[str]:
                 f"{there} saw to be free, by {1e3 * far:.0f} mm: {remedy}"
             )
             continue
-        one, other = new.of(new.ids == i), known.of(known.ids == i)
-        if min(len(one.points), len(other.points)) < _VOTES:
-            continue
-        motion = lay(one, other, _OBJECT_STEPS, turn=_OBJECT_TURN)  # beside the whole view's
-        if motion.offset > NAMED_OFFSET and motion.certain(_VOTES, 1.25 * _SIGMAS):
+        offset = shift_of(new.of(new.ids == i), known.of(known.ids == i))
+        if offset > NAMED_OFFSET:
             found.append(
-                f"object {i} lies {1e3 * motion.offset:.0f} mm off in {names[0]} from where "
+                f"object {i} lies {1e3 * offset:.0f} mm off in {names[0]} from where "
                 f"{names[1]} shows it: {remedy}"
             )
     return found
+
+
+def shift_of(one: Samples, other: Samples) -> float:
+    """Return how far (m) one object lies, for certain, beside where another view shows it."""
+    if min(len(one.points), len(other.points)) < _VOTES:
+        return 0.0
+    motion = lay(one, other, _OBJECT_STEPS, turn=_OBJECT_TURN)  # beside the whole view's
+    if not motion.certain(_VOTES, 1.25 * _SIGMAS):
+        return 0.0
+    # What two sides of an object have in common may leave it free to slide.
+    left = _disagreement(one.moved(motion.T), other)
+    return motion.offset if left < _BETTER * _disagreement(one, other) else 0.0
 
 
 # ---------------------------------------------------------------------------------------- ids
@@ -291,7 +321,7 @@ def _other_ids(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[dict[
     if not table:
         return {}, ""
     for new, before in zip(laid, known, strict=True):
-        far = np.concatenate([f[i > 0] for i, f in _in_free_space(new, before, _IN_FRONT)])
+        far = np.concatenate([f[i > 0] for i, f in _in_free_space(new, before, IN_FRONT)])
         if (far > 0).mean() > _MOVED:
             said = ", ".join(f"its {i} lies where theirs shows {j}" for i, j in table.items())
             return {}, (
@@ -305,7 +335,7 @@ def _other_ids(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[dict[
         tree = cKDTree(laid[0].points[laid[0].ids == i])
         gaps = {j: float(np.min(tree.query(points[owner == j])[0])) for j in vacant}
         near = min(gaps, key=gaps.__getitem__, default=0)
-        if near and gaps[near] < _BESIDE:
+        if near and gaps[near] < BESIDE:
             vacant.remove(near)
             table[i] = near
         else:
@@ -326,13 +356,14 @@ def _shared(laid: Sequence[Samples], known: Sequence[Samples]) -> tuple[Indices,
     mine, theirs = [], []
     for new, before in zip(laid, known, strict=True):
         there, back = look_up(before, new), look_up(new, before)
-        same, same_back = there.same(_SAME), back.same(_SAME)
+        same, same_back = there.same(SAME), back.same(SAME)
         mine += [new.ids[same], back.labels[same_back]]
         theirs += [there.labels[same], before.ids[same_back]]
     return np.concatenate(mine), np.concatenate(theirs)
 
 
-def _renamed(ids: np.ndarray, table: dict[int, int]) -> np.ndarray:
+def renamed(ids: np.ndarray, table: dict[int, int]) -> np.ndarray:
+    """Return ids or labels with others in their place."""
     result = ids.copy()
     for i, j in table.items():
         result[ids == i] = j
@@ -352,7 +383,8 @@ def samples_of(view: Observation) -> Samples:
     )
     row, column = np.divmod(np.concatenate([objects, others]), view.shape[1])
     points, normals, smooth = _normals(depth, view.intrinsics, row, column)
-    nearest = ndimage.minimum_filter(depth.astype(np.float32), _AROUND, mode="nearest")
+    free = np.where(view.sees_robot, 0.0, view.free_depth).astype(np.float32)
+    nearest = ndimage.minimum_filter(free, _AROUND, mode="nearest")
     images = (depth, nearest.astype(np.float64))
     ids, noise = view.labels[row, column], depth_sigma(points[:, 2])
     samples = Samples(view, np.eye(4), *images, points, normals, ids, noise)

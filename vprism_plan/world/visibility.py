@@ -127,8 +127,8 @@ def make_view(
     would all hide behind one another. The robot casts one always.
     """
     depth = np.asarray(observation.depth, dtype=np.float64)
-    valid = depth > 0
-    reach = np.where(valid, depth + np.maximum(tolerance, 3.0 * depth_sigma(depth)), np.inf)
+    valid, free = depth > 0, np.asarray(observation.free_depth, dtype=np.float64)
+    reach = np.where(free > 0, free + np.maximum(tolerance, 3.0 * depth_sigma(free)), np.inf)
     if plane is not None:
         points = observation.point_image()[valid]
         sigma = height_sigma(points - observation.camera_center, depth[valid], plane.normal)
@@ -137,10 +137,10 @@ def make_view(
         on_plane = plane.signed_distance(points) < threshold
         if observation.labels is not None:
             on_plane &= observation.labels[valid] == 0
-        on_plane &= ~observation.sees_robot[valid]
+        on_plane &= ~observation.sees_robot[valid] & (free == depth)[valid]
         reach[valid] = np.where(on_plane, np.inf, reach[valid])
-    view, own = _view(observation, reach, valid), free_balls([observation])
-    things = np.isfinite(reach) & ~observation.sees_robot
+    view, own = _view(observation, reach, free > 0), free_balls([observation])
+    things = valid & np.isfinite(reach) & ~observation.sees_robot
     against = speaking_against(observation, things, own if robots is None else robots)
     tables = _sparse_tables(against.astype(np.float32)) if np.isfinite(against).any() else None
     return replace(view, robot=own, against=tables)
