@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Objectives inside OMPL, and planning with them, where costs are known exactly."""
 
+import json
 from itertools import pairwise
 
 import disk_world
@@ -159,6 +160,8 @@ def test_length_has_a_history_too():
     costs = [step.cost for step in result.report.history]
     assert len(costs) > 1
     assert costs == sorted(costs, reverse=True)
+    told = json.loads(json.dumps(result.report.to_dict(), allow_nan=False))
+    assert [step["cost"] for step in told["history"]] == costs
 
 
 def test_a_straight_way_is_taken_at_once_only_if_it_runs_no_risk():

@@ -2,7 +2,6 @@
 """The commands `plan` and `demo`: a query, its answer, pictures, files and lines on both."""
 
 from collections.abc import Callable
-from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -203,9 +202,7 @@ def solve(
             "plan": {
                 "status": result.status,
                 "message": result.message,
-                **{field.name: getattr(report, field.name) for field in fields(report)},
-                "risk": None if report.risk is None else report.risk.to_dict(),
-                "allowed_contacts": [contact.to_dict() for contact in report.allowed_contacts],
+                **report.to_dict(),
             },
             "explanation": None if result.explanation is None else result.explanation.text(),
             "map": describe_map(world.map),

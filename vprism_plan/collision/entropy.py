@@ -11,6 +11,7 @@ from vprism_plan._arguments import number
 from vprism_plan.collision.explain import unit_ball_points
 from vprism_plan.collision.motion import edges_of, place_points
 from vprism_plan.collision.packing import Numbers, Rows, Waypoints
+from vprism_plan.collision.reports import Answer
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.world.grid import Chosen, Index, Points
@@ -21,7 +22,7 @@ _CHUNK = 1 << 20  # voxel candidates in memory at once
 
 
 @dataclass(frozen=True)
-class PathEntropy:
+class PathEntropy(Answer):
     """Answer of `path_entropy`; nats. Only links that joints move count.
 
     The map's entropy means something where it has support (kernel mass at least
@@ -66,16 +67,6 @@ class PathEntropy:
             f"{1000 * self.swept_volume:.1f} l swept (total {1000 * self.swept_total:.3f} l nats, "
             f"voxels of {1000 * self.resolution:g} mm)"
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values; null where nothing is supported."""
-
-        def plain(value: Any) -> Any:
-            if isinstance(value, tuple):
-                return [plain(v) for v in value]
-            return None if np.isnan(value) else value
-
-        return {name: plain(value) for name, value in vars(self).items()}
 
 
 def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> PathEntropy:
