@@ -105,7 +105,7 @@ def run_plan(command: Command, console: Console) -> int:
             "give --base-xyz, --start and --goal"
         )
         plan = {"status": "no_place", "message": message}
-        payload = {"solved": False, "plan": plan, "timings": console.timings}
+        payload = {"solved": False, "plan": plan}
         console.finish(payload, [f"no safe answer (no_place): {message}"])
         return 1
     given = {"base": command.base_xyz, "start": command.start}
@@ -213,9 +213,6 @@ def solve(
                 "max_risk": checker.config.max_risk,
             },
             "meshes": {str(i): {"triangles": len(mesh.faces)} for i, mesh in meshes.items()},
-            "timings": console.timings,
-            "compile_seconds": console.compile_seconds,
-            "compiled_kernels": console.compiled,
         }
         if path is not None:
             timed = time_parameterize(robot, path, checker=checker)
@@ -231,7 +228,8 @@ def solve(
                 payload["truth"] = true_distance(robot, path, truth)
         files = {p.relative_to(aside): p for p in sorted(aside.rglob("*")) if p.is_file()}
         payload["sizes"] = {str(name): file.stat().st_size for name, file in files.items()}
-        (aside / "report.json").write_text(dump_json(payload), encoding="utf-8")
+        text = dump_json(payload | console.about())
+        (aside / "report.json").write_text(text, encoding="utf-8")
         written = sorted({"report.json", *(name.parts[0] for name in files)})
     payload["output"] = command.output
     wrote = f"wrote {command.output}/: {', '.join(written)}"

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._files import jsonable
 from vprism_plan.world.grid import Vector
 from vprism_plan.world.sources import SourceKind, spoken
 
@@ -29,21 +30,8 @@ class Answer:
     """A dataclass that can become JSON: of numbers, text, and others of its kind."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values; null where there is no number."""
+        """Return JSON-ready values; null where a number is not finite."""
         return {name: jsonable(v) for name, v in vars(self).items() if not callable(v)}
-
-
-def jsonable(value: Any) -> Any:
-    """Return a value as JSON knows it: answers as objects, tuples and arrays as lists."""
-    if hasattr(value, "to_dict"):
-        return value.to_dict()
-    if isinstance(value, dict):
-        return {key: jsonable(v) for key, v in value.items()}
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [jsonable(v) for v in value]
-    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 @dataclass(frozen=True)

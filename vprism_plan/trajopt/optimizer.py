@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import choice, number, whole
+from vprism_plan._files import jsonable
 from vprism_plan.collision import CollisionChecker
-from vprism_plan.collision.reports import Answer, jsonable
+from vprism_plan.collision.reports import Answer
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
 from vprism_plan.planning.attempts import within_risk
