@@ -28,6 +28,7 @@ from vprism_plan.collision.packing import (
     pack_robot,
     pack_world,
     waypoints,
+    wider,
 )
 from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate
 from vprism_plan.collision.risk import PathRisk, Setting, make_setting
@@ -37,13 +38,6 @@ from vprism_plan.world.grid import Chosen, Values
 _BATCH_CHUNK = 512
 _CHORD = 0.002  # metres that anything moves along a chord of a rounded corner, at most
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
-
-
-def _wider(world: PackedWorld, extra: float) -> PackedWorld:
-    distance, blocks, floats = world
-    floats = floats.copy()
-    floats[MARGIN] += extra
-    return distance, blocks, floats
 
 
 class _AnyDraw:
@@ -281,7 +275,7 @@ class CollisionChecker(explain.Checker):
         number("extra", extra, 0.0, unit="metres: a margin can only be widened")
         other = self._with(
             config=replace(self.config, margin=self.config.margin + extra),
-            _world=_wider(self._world, extra),
+            _world=wider(self._world, extra),
         )
         vars(other).pop("_what_was_seen", None)  # packed with the margin
         return other

@@ -206,6 +206,14 @@ def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
     return distance, blocks, floats
 
 
+def wider(world: PackedWorld, extra: float) -> PackedWorld:
+    """Return a packed world from which `extra` metres more are to be kept."""
+    distance, blocks, floats = world
+    floats = floats.copy()
+    floats[MARGIN] += extra
+    return distance, blocks, floats
+
+
 def configuration(robot: Any, q: Numbers) -> Configuration:
     """Return a configuration, itself if the kernels can read it; whether it is finite is for a
     verdict to say."""

@@ -19,12 +19,12 @@ from vprism_plan.collision.config import CheckerConfig
 from vprism_plan.collision.explain import nearest_source, unit_ball_points, volume_shares
 from vprism_plan.collision.packing import (
     AT_MOST,
-    MARGIN,
     Configuration,
     Rows,
     Waypoints,
     pack_robot,
     pack_world,
+    wider,
 )
 from vprism_plan.collision.reports import Contact, FirstContact, RiskEstimate, as_point
 from vprism_plan.errors import ConfigError, RobotError
@@ -88,10 +88,7 @@ class Setting:
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The same for the kernels, with the margin: distances, block bounds, floats."""
-        distance, blocks, floats = self.certain.packed
-        floats = floats.copy()
-        floats[MARGIN] += self.margin
-        return distance, blocks, floats
+        return wider(self.certain.packed, self.margin)
 
 
 def grown(setting: Setting, voxels: float) -> Setting:
