@@ -155,11 +155,11 @@ def run_mesh(command: Command, console: Console) -> int:
 def run_export(command: Command, console: Console) -> int:
     """Write the world or the trajectory; exit code 0."""
     if command.input.suffix == ".json":
-        from vprism_plan.planning.trajectory import read_trajectory, write_message
+        from vprism_plan.planning.trajectory import read_trajectory, write_trajectory
 
         names, trajectory = read_trajectory(command.input)
         with console.stage("export"):
-            write_message(command.output, names, trajectory, command.frame_id)
+            write_trajectory(command.output, names, trajectory, command.frame_id)
     else:
         from vprism_plan.world import World, WorldConfig
 

@@ -2,7 +2,6 @@
 """The commands `plan` and `demo`: a query, its answer, pictures, files and lines on both."""
 
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -178,6 +177,7 @@ def solve(
     objects (N, 3) -> (N,), metres, where it is known: for pictures and the report only.
     """
     from vprism_plan.planning import plan, time_parameterize, write_trajectory
+    from vprism_plan.planning.path import interpolated
 
     options = {"planner": command.planner, "time_limit": command.time_limit, "seed": command.seed}
     with console.stage("plan"):
@@ -218,7 +218,7 @@ def solve(
             timed = time_parameterize(robot, path, checker=checker)
             write_trajectory(aside / "trajectory.json", robot, timed, frame_id="world")
             payload["trajectory"] = {"duration": timed.duration, "points": len(timed.times)}
-            dense = dense_path(path, 0.01)
+            dense = interpolated(path, 0.01)
             clearance = checker.clearance_batch(dense)
             shown = np.linspace(0, len(dense) - 1, min(_PROFILE, len(dense))).astype(int)
             extremes = {"minimum": float(clearance.min()), "mean": float(clearance.mean())}
@@ -256,22 +256,15 @@ def _draw(
         save_figure(figure, folder / "plan.png")
 
 
-def dense_path(path: np.ndarray, step: float) -> np.ndarray:
-    """Return a path with configurations at most `step` apart in every joint, corners kept."""
-    pieces = [path[:1]]
-    for a, b in pairwise(path):
-        count = max(1, int(np.ceil(np.abs(b - a).max() / step)))
-        pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
-    return np.concatenate(pieces)
-
-
 def true_distance(robot: "Robot", path: np.ndarray, truth: Distance) -> dict[str, Any]:
     """Return the smallest distance of the moving spheres to the real objects, metres.
 
     Also how far any sphere moves between two samples, which bounds what they can miss.
     """
+    from vprism_plan.planning.path import interpolated
+
     moving = np.flatnonzero(~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)])
-    dense = dense_path(path, 0.0015)
+    dense = interpolated(path, 0.0015)
     gaps, places = [], []
     for begin in range(0, len(dense), 256):
         centers = robot.sphere_centers(dense[begin : begin + 256])[:, moving]

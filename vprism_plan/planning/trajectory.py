@@ -273,21 +273,14 @@ def write_trajectory(
 
     Accelerations and efforts stay empty, which the message allows: given accelerations,
     controllers fit quintics, which a trapezoidal profile is not. Joint motions need no
-    `frame_id`. The robot brings `joint_names`, in the order of the columns.
+    `frame_id`. The robot brings `joint_names`, in the order of the columns, or is these names.
 
     Raises:
         PlanningError: joints and columns differ in number, or two points fall on the
             same nanosecond.
         MissingDependencyError: rosbags is not installed.
     """
-    write_message(path_file, robot.joint_names, trajectory, frame_id)
-
-
-def write_message(
-    path_file: str | Path, joint_names: Iterable[str], trajectory: Trajectory, frame_id: str = ""
-) -> None:
-    """`write_trajectory` for joints of these names."""
-    names = [str(name) for name in joint_names]
+    names = [str(name) for name in getattr(robot, "joint_names", robot)]
     if trajectory.positions.shape[1:] != (len(names),):
         given = f"{trajectory.positions.shape[1:]} joints"
         raise PlanningError(f"the trajectory has {given}, the robot {', '.join(names)}")
