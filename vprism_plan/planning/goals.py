@@ -322,17 +322,16 @@ def valid_goals(
         )
         return PlanResult(None, "invalid_goal", report, message)
     good: list[np.ndarray] = []
-    refused: list[PlanResult] = []
     notes: list[RefusedGoal] = []
+    explanations: list[Any] = []
     most = config.max_goals if what else len(found)  # the caller's own are all kept
     for q in found:
-        refusal = refuse(checker, q, "goal", report)
-        if refusal is None:
+        why = _refusal(checker, q)
+        if why is None:
             good.append(q)
         else:
-            refused.append(refusal)
-            reason = refusal.message.removeprefix("goal is invalid: ")
-            notes.append(RefusedGoal(tuple(q.tolist()), reason))
+            notes.append(RefusedGoal(tuple(q.tolist()), why[0]))
+            explanations.append(why[1])
         if len(good) == most:
             break
     report = replace(report, refused_goals=tuple(notes))
@@ -340,4 +339,4 @@ def valid_goals(
         return np.array(good), report
     said = f"found for the goal {what}" if what else "given as goals"
     message = f"all {len(found)} configurations {said} are invalid, the first: {notes[0].reason}"
-    return replace(refused[0], report=report, message=message)
+    return PlanResult(None, "invalid_goal", report, message, explanation=explanations[0])
