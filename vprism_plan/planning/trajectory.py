@@ -62,13 +62,10 @@ class Trajectory:
         t = np.clip(np.asarray(times, dtype=np.float64), 0.0, self.duration)
         if len(self.times) == 1:
             return self.positions[np.zeros(len(t), int)], self.velocities[np.zeros(len(t), int)]
-        i = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
-        h = (self.times[i + 1] - self.times[i])[:, None]
-        u = (t - self.times[i])[:, None] / h
-        p, q = self.positions[i], self.positions[i + 1]
-        v, w = h * self.velocities[i], h * self.velocities[i + 1]
-        a, b = 3.0 * (q - p) - 2.0 * v - w, 2.0 * (p - q) + v + w
-        return p + u * (v + u * (a + u * b)), (v + u * (2.0 * a + 3.0 * u * b)) / h
+        from scipy.interpolate import CubicHermiteSpline
+
+        motion = CubicHermiteSpline(self.times, self.positions, self.velocities)
+        return motion(t), motion(t, 1)
 
 
 def time_parameterize(
