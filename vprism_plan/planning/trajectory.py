@@ -182,33 +182,28 @@ def _timed(
     rate, cruise = top / ramp, 1.0 / top - ramp
     total = cruise + 2.0 * ramp
 
-    def profile(t: float) -> tuple[float, float]:
-        """s and s' of the trapezoid at time t."""
-        if t <= ramp:
-            return 0.5 * rate * t * t, rate * t
-        if t < total - ramp:
-            return top * (t - 0.5 * ramp), top
-        left = total - t
-        return 1.0 - 0.5 * rate * left * left, rate * left
+    climb = 0.5 * top * ramp  # s at the first knee
 
     def time_at(s: float) -> float:
         """Time at which the trapezoid reaches s."""
-        if s <= 0.5 * top * ramp:
+        if s <= climb:
             return math.sqrt(2.0 * s / rate)
-        if s <= 1.0 - 0.5 * top * ramp:
+        if s <= 1.0 - climb:
             return s / top + 0.5 * ramp
         return total - math.sqrt(2.0 * (1.0 - s) / rate)
 
     inner = np.linalg.norm(line[1:-1] - line[0], axis=1) / np.linalg.norm(whole)
     events = [(time_at(float(s)), q) for s, q in zip(inner, line[1:-1], strict=True)]
-    knees = [ramp] if cruise <= 1e-9 * total else [ramp, ramp + cruise]
-    events += [(t, line[0] + profile(t)[0] * whole) for t in knees]
+    events.append((ramp, line[0] + climb * whole))
+    if cruise > 1e-9 * total:
+        events.append((ramp + cruise, line[0] + (1.0 - climb) * whole))
     events.sort(key=lambda event: event[0])
+    knots, rates = (0.0, ramp, ramp + cruise, total), (0.0, top, top, 0.0)
     previous = 0.0
     for t, q in events:
         # A knee that falls on a waypoint is one point, not two.
         if t - previous > 1e-9 * total and total - t > 1e-9 * total:
-            yield t, q, profile(t)[1] * whole
+            yield t, q, np.interp(t, knots, rates) * whole
             previous = t
     yield total, line[-1], 0.0 * whole
 
