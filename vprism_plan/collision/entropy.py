@@ -158,11 +158,20 @@ def swept_voxels(checker: Any, Q: Rows, resolution: float) -> Int[np.ndarray, "v
     """Voxels (centres at resolution * (i, j, k), world, metres), each once, whose centre lies in
     a sphere of a moving link at some row of Q; RobotError if they would be too many."""
     centers, radii = _moving(checker, Q)
+    ways = [_thinned(way, 0.5 * resolution) for way in np.moveaxis(centers, 1, 0)]
+    places = np.concatenate([np.empty((0, 3)), *ways])
+    return voxels_in(places, np.repeat(radii, [len(way) for way in ways]), resolution)
+
+
+def voxels_in(
+    centers: Points, radii: Float[np.ndarray, " n"], resolution: float
+) -> Int[np.ndarray, "v 3"]:
+    """The same for any balls."""
     if len(radii) == 0:
         return np.empty((0, 3), dtype=np.int64)
     grown = radii[:, None] + 2.0 * resolution
-    low = np.floor((centers - grown).min(axis=(0, 1)) / resolution).astype(np.int64)
-    high = np.ceil((centers + grown).max(axis=(0, 1)) / resolution).astype(np.int64)
+    low = np.floor((centers - grown).min(axis=0) / resolution).astype(np.int64)
+    high = np.ceil((centers + grown).max(axis=0) / resolution).astype(np.int64)
     shape = tuple(int(n) for n in high - low + 1)
     if float(np.prod(high - low + 1.0)) > _MAX_CELLS:
         raise RobotError(
@@ -170,8 +179,8 @@ def swept_voxels(checker: Any, Q: Rows, resolution: float) -> Int[np.ndarray, "v
             f"{' x '.join(map(str, shape))} (at most {_MAX_CELLS:,}); give a coarser resolution"
         )
     swept = np.zeros(shape, dtype=bool)
-    for s, radius in enumerate(radii):
-        _stamp(swept, low, _thinned(centers[:, s], 0.5 * resolution), float(radius), resolution)
+    for radius in np.unique(radii).tolist():
+        _stamp(swept, low, centers[radii == radius], radius, resolution)
     return np.argwhere(swept) + low
 
 
