@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from vprism_plan._arguments import number, rigid_pose, whole
+from vprism_plan.collision.explain import limit_contacts
 from vprism_plan.errors import PlanningError, RobotError
 from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip
 from vprism_plan.planning.ompl_adapter import nearest_turns
@@ -246,17 +247,11 @@ def numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
 
 def _refusal(checker: CheckerLike, q: Configuration) -> tuple[str, Any] | None:
     """Why q must not be used, and the checker's report on it; None if it may be."""
-    robot = checker.robot
-    # Outside the limits OMPL would refuse without a reason.
-    bad = outside_limits(robot, q)
-    if not bad.any() and checker.is_valid(q):
+    limits = limit_contacts(checker.robot, q)  # outside them OMPL would refuse without a reason
+    if not limits and checker.is_valid(q):
         return None
-    outside = ", ".join(
-        f"joint {robot.joint_names[i]} is {q[i]:.6g}, outside [{robot.lower[i]:.6g}, "
-        f"{robot.upper[i]:.6g}] by {max(robot.lower[i] - q[i], q[i] - robot.upper[i]):.3g}"
-        for i in np.flatnonzero(bad)
-    )
     explanation = checker.explain(q)
+    outside = ", ".join(contact.text() for contact in limits)
     return outside if explanation.valid else one_line(explanation), explanation
 
 
