@@ -110,8 +110,7 @@ class CollisionChecker(explain.Checker):
         self.robot = robot
         self.config = CheckerConfig() if config is None else config
         self._rules, self._link_rules = contact_rules(robot, self.config.allowed_contacts)
-        packed = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
-        self._rf, self._ri = packed.floats, packed.ints
+        self._rf, self._ri = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
         self._fields = [world.field]
         self._fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
         # What `clearance` is measured to; verdicts are given by `_world`.

@@ -118,13 +118,13 @@ def make_setting(
     tables = np.array([worlds.rule(ids) for ids in rules], dtype=np.int64)
     per_link = np.where(arrays.link_fixed, -1, tables[link_rules])
     alone = replace(arrays, pairs=np.empty((0, 2), np.int64))
-    packed = pack_robot(alone, rules=link_rules)
-    limits = packed.floats[packed.ints[19] :][: 2 * packed.ints[4]]
+    floats, ints = pack_robot(alone, rules=link_rules)
+    limits = floats[ints[19] :][: 2 * ints[4]]
     limits[0::2], limits[1::2] = -np.inf, np.inf  # whatever the joint values, spheres collide
     spacing = min(resolution, 0.5 * float(world.map.kernel_length))
     return Setting(
         world, robot, config, worlds, radii, tables, per_link[arrays.sphere_link].astype(np.int64),
-        Certain(world, rules), packed.floats, packed.ints, spacing,
+        Certain(world, rules), floats, ints, spacing,
     )  # fmt: skip
 
 
