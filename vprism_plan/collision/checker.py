@@ -111,10 +111,11 @@ class CollisionChecker(explain.Checker):
         self.config = CheckerConfig() if config is None else config
         self._rules, self._link_rules = contact_rules(robot, self.config.allowed_contacts)
         self._rf, self._ri = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
-        self._fields = [world.field]
-        self._fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
+        # What verdicts go by, under each contact rule.
+        self.fields = [world.field]
+        self.fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
         # What `clearance` is measured to; verdicts are given by `_world`.
-        self._surfaces = pack_world(world, self._fields, self.config.margin)
+        self._surfaces = pack_world(world, self.fields, self.config.margin)
         self._world = self._surfaces
         self._lock = threading.Lock()
         self._path_risk: PathRisk | None = None
@@ -125,7 +126,7 @@ class CollisionChecker(explain.Checker):
             self._bounded = self._risk()
             self._draws = _AnyDraw(self._bounded.setting)
             if self.config.max_risk >= world.config.level:
-                self._fields, self._world = self._what_was_seen
+                self.fields, self._world = self._what_was_seen
         self._warm_up()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -288,7 +289,7 @@ class CollisionChecker(explain.Checker):
         config = replace(self.config, max_risk=max_risk)
         fields, world = self._what_was_seen
         bounded = self._bounded.bounded_by(config)
-        return self._with(config=config, _bounded=bounded, _fields=fields, _world=world)
+        return self._with(config=config, _bounded=bounded, fields=fields, _world=world)
 
     def _with(self, **changes: Any) -> "CollisionChecker":
         other = copy.copy(self)
@@ -314,7 +315,7 @@ class CollisionChecker(explain.Checker):
 
     def verdict_field(self, link: int) -> Any:
         """Return the distance field that verdicts check a link (index) against."""
-        return self._fields[int(self._link_rules[link])]
+        return self.fields[int(self._link_rules[link])]
 
     def allowed_objects(self, link: int) -> frozenset[int]:
         """Return the ids of the objects that a link (index) may touch."""
