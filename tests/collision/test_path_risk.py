@@ -669,7 +669,7 @@ def test_validity_is_few_enough_worlds_nothing_certain_and_off_the_level_set(
         estimates = [checker.collision_probability(q) for q in Q]
         certain = np.array([e.certain for e in estimates])
         off = ~on_level_set(checker, Q)
-        expected = ~certain & (hits <= checker._risk().allowed) & off
+        expected = ~certain & (hits <= checker._path_risk.allowed) & off
         np.testing.assert_array_equal(singles, expected)
         np.testing.assert_array_equal(singles, off & [e.upper <= bound for e in estimates])
         valid[bound] = singles

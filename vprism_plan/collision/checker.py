@@ -2,7 +2,6 @@
 """The collision checker: a robot's spheres against a world that knows what it has not seen."""
 
 import copy
-import threading
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
@@ -117,25 +116,15 @@ class CollisionChecker(explain.Checker):
         # What `clearance` is measured to; verdicts are given by `_world`.
         self._surfaces = pack_world(world, self.fields, self.config.margin)
         self._world = self._surfaces
-        self._lock = threading.Lock()
-        self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
         self._draws: Any = None
         posterior = hasattr(world, "certain_field") and hasattr(world.map, "sample_weights")
         if self.config.max_risk is not None and posterior:
-            self._bounded = self._risk()
+            self._bounded = self._path_risk
             self._draws = _AnyDraw(self._bounded.setting)
             if self.config.max_risk >= world.config.level:
                 self.fields, self._world = self._what_was_seen
         self._warm_up()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Every copy, in this process or another, has a lock of its own."""
-        self.__dict__.update(state)
-        self._lock = threading.Lock()
 
     @cached_property
     def _what_was_seen(self) -> tuple[list[Any], PackedWorld]:
@@ -390,8 +379,8 @@ class CollisionChecker(explain.Checker):
         mild.
         """
         rows = waypoints(self.robot, path, single=True)
-        risk = self._risk()
-        return (risk.held_out() if held_out else risk).estimate(rows)
+        risk = self._path_risk
+        return (risk.held_out if held_out else risk).estimate(rows)
 
     def _ruled_world(self) -> Any:
         if not hasattr(self.world, "certain_field"):
@@ -401,17 +390,13 @@ class CollisionChecker(explain.Checker):
             )
         return self.world
 
-    def _risk(self) -> PathRisk:
-        with self._lock:
-            if self._path_risk is None:
-                self._path_risk = PathRisk(
-                    make_setting(
-                        self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
-                    )
-                )
-            return self._path_risk
+    @cached_property
+    def _path_risk(self) -> PathRisk:
+        """Made when it is asked for; if two threads ask at once, twice, of the same draws."""
+        world = self._ruled_world()
+        return PathRisk(make_setting(world, self.robot, self.config, self._rules, self._link_rules))
 
     def risk_setting(self, held_out: bool = False) -> Setting:
         """Return what probabilities are counted with; `held_out` as in `collision_probability`."""
-        risk = self._risk()
-        return (risk.held_out() if held_out else risk).setting
+        risk = self._path_risk
+        return (risk.held_out if held_out else risk).setting

@@ -312,7 +312,6 @@ class PathRisk:
         # Where something may be touched, a voxel said to be its own may hide another object.
         hidden = worlds.error_free + (worlds.error_occupied if any(rules) else 0.0)
         self._upper = np.minimum(upper + hidden, 1.0)
-        self._held_out: PathRisk | None = None
         self._lost = np.zeros(config.n_worlds, np.bool_)  # worlds that no verdict counts
         self.allowed = 0
         if config.max_risk is not None:
@@ -343,15 +342,14 @@ class PathRisk:
         stricter.allowed = left >> min(level, halvings)
         return stricter
 
+    @cached_property
     def held_out(self) -> "PathRisk":
-        """Return the same with worlds that no verdict has seen."""
-        if self._held_out is None:
-            other = copy.copy(self)
-            worlds = self.setting.worlds
-            other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
-            other._blurred = grown(other.setting, BLUR)
-            self._held_out = other
-        return self._held_out
+        """The same with worlds that no verdict has seen."""
+        other = copy.copy(self)
+        worlds = self.setting.worlds
+        other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
+        other._blurred = grown(other.setting, BLUR)
+        return other
 
     def accepts(self, path: Waypoints) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
