@@ -133,7 +133,6 @@ def test_checkers_are_copied_before_and_after_probabilities_were_asked(
     after = duplicate(checker)
     for other in (before, after):
         assert answers(other, Q) == expected
-        assert other._lock is not checker._lock
         assert other.robot.lower.flags.writeable is False
     assert after.tightened(1) is not None if settings else after.config == checker.config
 

@@ -2,6 +2,7 @@
 """Files appear whole or not at all, and whatever is in one that is read, it fails in one line."""
 
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -118,6 +119,22 @@ def read_json(path: Path, error: type[VPrismError]) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise error(f"{path} holds a {type(content).__name__}; it must be an object")
         return content
+
+
+def jsonable(value: Any) -> Any:
+    """Return a value as strict JSON knows it: what has a `to_dict` as that, tuples and arrays as
+    lists, paths as text, NaN and infinities as null."""
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if hasattr(value, "tolist"):  # numpy's
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(key): jsonable(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
 
 
 def optional(module: str, extra: str, needs: str) -> ModuleType:

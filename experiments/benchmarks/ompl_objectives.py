@@ -203,7 +203,7 @@ def speed(seed: int = FIRST_SCENE, n: int = 600) -> dict[str, float]:
         pairs.append((a, np.ascontiguousarray(a + (b - a) / far)))
     found = {"check_motion": _per_call(bench.checker.check_motion_buffer, pairs)}
     for kind in ("joint", "survival", "occupancy", "entropy"):
-        found[kind] = _per_call(PathCost(bench.checker, kind).risk.motion, pairs)
+        found[kind] = _per_call(PathCost(bench.checker, RiskObjective(kind)).risk.motion, pairs)
     with quiet_ompl():
         space = state_space(bench.robot)
         objective = VPrismRiskObjective(ob.SpaceInformation(space), bench.checker)

@@ -336,10 +336,10 @@ def test_a_map_is_exported_by_its_suffix(suffix, saved_map, tmp_path, capsys):
 
 
 def test_a_trajectory_is_exported_for_ros(tmp_path, capsys):
-    from vprism_plan.planning.trajectory import Trajectory, write_message
+    from vprism_plan.planning.trajectory import Trajectory, write_trajectory
 
     motion = Trajectory(np.array([0.0, 1.5]), np.array([[0.0], [1.0]]), np.zeros((2, 1)))
-    write_message(tmp_path / "trajectory.json", ["slide"], motion)
+    write_trajectory(tmp_path / "trajectory.json", ["slide"], motion)
     code, *_ = call(
         capsys, "export", tmp_path / "trajectory.json", "--output", tmp_path / "t.yaml",
         "--frame-id", "map",

@@ -11,8 +11,9 @@ from vprism_plan.cli import main
 from vprism_plan.cli._console import Console, dump_json, staged
 from vprism_plan.cli._parsing import UsageError, parse
 from vprism_plan.cli._placing import Surroundings, candidate_bases, choose_ends
-from vprism_plan.cli._plans import PLAN_FILES, dense_path, pose_matrix, true_distance
+from vprism_plan.cli._plans import PLAN_FILES, pose_matrix, true_distance
 from vprism_plan.errors import PlanningError, VPrismError
+from vprism_plan.planning.path import interpolated
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_true_distance_finds_the_nearest_sphere(ball_robot):
     assert exact <= truth["minimum_distance"] <= exact + 1e-5
     assert truth["largest_motion_between_samples"] < 0.002
     assert truth["fraction"] == pytest.approx(0.5, abs=0.01)
-    dense = dense_path(path, 0.01)
+    dense = interpolated(path, 0.01)
     assert len(dense) == 101
     np.testing.assert_array_equal(dense[[0, -1]], path)
 

@@ -53,7 +53,7 @@ def test_compiled_kinematics_equal_products_of_matrices(seed):
     packed = pack_robot(arrays)
     q = random_q(rng, arrays)
     centers = np.empty((3, len(arrays.sphere_radius)))
-    kernels.place_spheres(q, packed.floats, packed.ints, centers)
+    kernels.place_spheres(q, *packed, centers)
     np.testing.assert_allclose(centers.T, sphere_positions(arrays, q), atol=1e-12)
 
 

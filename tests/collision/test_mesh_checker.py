@@ -335,7 +335,7 @@ def test_planes_are_exact_for_every_solid(world, flyer):
                 points = outline_of(poses[name], shape)
                 sampled = (points @ plane[:3]).min() - plane[3]
                 assert sampled - 0.001 <= gaps[i] <= sampled + 1e-9
-                lowest = checker.placed.lowest_point(i, plane[:3])
+                lowest = checker.placed.lowest_points(plane[:3])[i]
                 assert lowest @ plane[:3] - plane[3] == pytest.approx(gaps[i], abs=1e-12)
 
 

@@ -121,7 +121,7 @@ def steps_of(checker, path):
     """Samples of each edge: as many as gaps need, or four times that, again and again."""
     packed = pack_robot(checker.robot.arrays)
     steps = np.empty(len(path) - 1, np.int64)
-    kernels.count_steps(path, packed.floats, packed.ints, setting(checker).spacing, steps)
+    kernels.count_steps(path, *packed, setting(checker).spacing, steps)
     found = np.diff(swept(checker, path).waypoints)
     assert np.isin(found / steps, [1, 4, 16, 64]).all()
     return found
@@ -236,10 +236,10 @@ def test_slack_covers_the_way_between_samples(seed, spacing):
     packed = pack_robot(arrays)
     path = np.array([random_q(rng, arrays) for _ in range(3)])
     steps = np.empty(2, np.int64)
-    n = kernels.count_steps(path, packed.floats, packed.ints, spacing, steps) + 1
+    n = kernels.count_steps(path, *packed, spacing, steps) + 1
     centers = np.empty((n, 3, len(arrays.sphere_radius)))
     slack = np.empty((n, len(arrays.sphere_radius)))
-    kernels.place_path(path, steps, packed.floats, packed.ints, centers, slack)
+    kernels.place_path(path, steps, *packed, centers, slack)
     assert slack.max() <= 0.625 * spacing + 1e-12  # what the reach of the worlds counts on
     centers = centers.transpose(0, 2, 1)
     radius = np.asarray(arrays.sphere_radius)
@@ -281,10 +281,10 @@ def test_a_joint_that_turns_without_carrying_anything_adds_no_slack():
     packed = pack_robot(still)
     path = np.array([np.full(3, -9.0), np.full(3, 9.0)])
     steps = np.empty(1, np.int64)
-    n = kernels.count_steps(path, packed.floats, packed.ints, H, steps) + 1
+    n = kernels.count_steps(path, *packed, H, steps) + 1
     centers = np.empty((n, 3, len(still.sphere_radius)))
     slack = np.empty((n, len(still.sphere_radius)))
-    kernels.place_path(path, steps, packed.floats, packed.ints, centers, slack)
+    kernels.place_path(path, steps, *packed, centers, slack)
     assert slack.max() <= 0.625 * H + 1e-12
 
 
@@ -669,7 +669,7 @@ def test_validity_is_few_enough_worlds_nothing_certain_and_off_the_level_set(
         estimates = [checker.collision_probability(q) for q in Q]
         certain = np.array([e.certain for e in estimates])
         off = ~on_level_set(checker, Q)
-        expected = ~certain & (hits <= checker._risk().allowed) & off
+        expected = ~certain & (hits <= checker._path_risk.allowed) & off
         np.testing.assert_array_equal(singles, expected)
         np.testing.assert_array_equal(singles, off & [e.upper <= bound for e in estimates])
         valid[bound] = singles

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Objectives inside OMPL, and planning with them, where costs are known exactly."""
 
+import json
 from itertools import pairwise
 
 import disk_world
@@ -106,7 +107,7 @@ def test_a_turn_behind_pi_is_integrated_where_it_goes():
     gap = 2 * np.pi - 6.0
     assert path.cost(objective).value() == pytest.approx(2 * gap)
     assert min(Q[:, 0].min() for Q in seen) >= 3.0 - 1e-12
-    cost = PathCost(checker, rates, length_weight=1.0)
+    cost = PathCost(checker, RiskObjective(rates, length_weight=1.0))
     assert cost.edge(np.array([3.0, 0.0]), np.array([3.0 + gap, 0.0])) == pytest.approx(2 * gap)
 
 
@@ -127,7 +128,7 @@ def test_planners_that_honour_an_objective_go_where_the_risk_is_not(planner):
     assert result.path[1:-1, 1].min() < -0.25
     assert result.report.objective == "function"
     assert result.report.cost == pytest.approx(
-        PathCost(one_disk(), above).path(result.path), abs=1e-12
+        PathCost(one_disk(), RiskObjective(above)).path(result.path), abs=1e-12
     )
 
 
@@ -144,7 +145,7 @@ def test_costs_fall_over_time_and_the_last_path_is_the_best():
         assert all(b.cost <= a.cost + 1e-12 for a, b in pairwise(history))
         assert all(b.time >= a.time for a, b in pairwise(history))
         assert result.report.cost <= history[-1].cost + 1e-9
-        cost = PathCost(one_disk(), slope, spacing=0.2)
+        cost = PathCost(one_disk(), RiskObjective(slope, spacing=0.2))
         for step in history:
             assert cost.path(step.path) == pytest.approx(step.cost, rel=1e-6)
         found.append(result.path)
@@ -159,6 +160,8 @@ def test_length_has_a_history_too():
     costs = [step.cost for step in result.report.history]
     assert len(costs) > 1
     assert costs == sorted(costs, reverse=True)
+    told = json.loads(json.dumps(result.report.to_dict(), allow_nan=False))
+    assert [step["cost"] for step in told["history"]] == costs
 
 
 def test_a_straight_way_is_taken_at_once_only_if_it_runs_no_risk():
@@ -184,7 +187,7 @@ def test_neither_shortening_nor_moving_waypoints_raises_the_cost(seed, worst):
     def bumps(Q):
         return np.exp(-np.sum((Q[:, None] - at) ** 2, axis=2) / size**2).sum(axis=1)
 
-    cost = PathCost(checker, bumps, spacing=0.05, worst=worst)
+    cost = PathCost(checker, RiskObjective(bumps, spacing=0.05, worst=worst))
     accepted = {(a.tobytes(), b.tobytes()) for a, b in pairwise(ZIGZAG)}
 
     def check(a, b):
@@ -214,9 +217,13 @@ def test_without_the_cost_a_shortcut_would_take_the_risk():
         return 100.0 * np.exp(-(np.sum(Q**2, axis=1)) / 0.2**2)
 
     blind = shorten(way, free.check_motion, 0, 1.0, lambda: 0.0)
-    aware = shorten(way, free.check_motion, 0, 1.0, lambda: 0.0, PathCost(free, ridge))
+    aware = shorten(
+        way, free.check_motion, 0, 1.0, lambda: 0.0, PathCost(free, RiskObjective(ridge))
+    )
     assert len(blind) == 2
-    assert PathCost(free, ridge).path(aware) <= PathCost(free, ridge).path(way)
+    assert PathCost(free, RiskObjective(ridge)).path(aware) <= PathCost(
+        free, RiskObjective(ridge)
+    ).path(way)
 
 
 @pytest.mark.parametrize("planner", ["RRTConnect", "AORRTC", "PRMstar", "KPIECE1"])

@@ -25,7 +25,6 @@ from vprism_plan.planning import (
     to_state,
 )
 from vprism_plan.planning.ompl_adapter import nearest_turns
-from vprism_plan.planning.protocols import RobotLike
 
 
 def attach(checker, space=None):
@@ -44,7 +43,6 @@ def one_disk(continuous=()):
 def test_the_fake_is_what_planning_asks_for():
     checker = one_disk()
     assert isinstance(checker, CheckerLike)
-    assert isinstance(checker.robot, RobotLike)
 
 
 @settings(max_examples=100, deadline=None)

@@ -158,7 +158,7 @@ def test_an_end_outside_the_limits_names_the_joint_even_if_the_checker_does_not_
     checker = Careless([], [], disk_world.robot())
     result = plan(checker, START, [0.7, 1.5])
     assert result.status == "invalid_goal"
-    assert "joint_1 is 1.5, outside [-1, 1]" in result.message
+    assert "joint_1 is 1.5, outside its limits [-1, 1]" in result.message
 
 
 @pytest.mark.parametrize("planner", COMMON)

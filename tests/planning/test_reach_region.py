@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Goals that are a region: drawn, solved, refused with reasons, planned to."""
 
+import json
+
 import numpy as np
 import pytest
 from oracles.checker_oracle import BallWorld
@@ -80,6 +82,8 @@ def test_solutions_that_the_checker_refuses_are_listed_with_the_reason(arm):
     assert "found for the goal region are invalid" in result.message
     assert len(result.report.refused_goals) >= 1
     assert all(refused.reason for refused in result.report.refused_goals)
+    told = json.loads(json.dumps(result.report.to_dict()))
+    assert told["refused_goals"][0]["reason"]
 
 
 def test_a_region_out_of_reach_is_an_invalid_goal(free):

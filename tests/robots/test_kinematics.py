@@ -45,7 +45,7 @@ def place_spheres(arrays, q):
 def kernel_centers(robot: Robot, q: np.ndarray) -> np.ndarray:
     packed = pack_robot(robot.arrays)
     centers = np.empty((3, len(robot.sphere_radii)))
-    checking.place_spheres(q, packed.floats, packed.ints, centers)
+    checking.place_spheres(q, *packed, centers)
     return centers.T
 
 

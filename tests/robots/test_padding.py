@@ -41,7 +41,7 @@ def well_formed(robot: Robot) -> None:
     assert a.pairs.max(initial=-1) < len(robot.link_names)
     for name, value in vars(a).items():
         assert value.flags.c_contiguous, name
-    assert pack_robot(a).floats.dtype == np.float64
+    assert pack_robot(a)[0].dtype == np.float64
 
 
 def padded_surface(solid: PrimitiveGeometry, spacing: float) -> np.ndarray:
@@ -259,12 +259,12 @@ def test_padded_pairs_equal_the_slow_oracle(seed):
             np.empty(len(arrays.pairs)),
             np.zeros((len(arrays.pairs), 2), dtype=np.int64),
         )
-        checking.pair_gaps(q, packed.floats, packed.ints, gaps, spheres)
+        checking.pair_gaps(q, *packed, gaps, spheres)
         assert gaps.min(initial=np.inf) == pytest.approx(
             checker_oracle.self_clearance(arrays, q), abs=1e-12
         )
         again = gaps.copy()
-        checking.pair_gaps(q, plain.floats, plain.ints, again, spheres)
+        checking.pair_gaps(q, *plain, again, spheres)
         np.testing.assert_allclose(gaps, again, atol=1e-12)
 
 

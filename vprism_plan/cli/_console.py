@@ -2,7 +2,6 @@
 """What a command puts out: progress and times, the result, folders of files."""
 
 import json
-import math
 import sys
 import tempfile
 import time
@@ -11,8 +10,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from vprism_plan._files import jsonable
 from vprism_plan.errors import VPrismError
 
 if TYPE_CHECKING:
@@ -102,11 +100,20 @@ class Console:
         if self.strict and self.warnings:
             raise VPrismError(f"--strict: {'; '.join(self.warnings)}")
 
+    def about(self) -> dict[str, Any]:
+        """Return what every result says beside the answer."""
+        return {
+            "timings": self.timings,
+            "compile_seconds": self.compile_seconds,
+            "compiled_kernels": self.compiled,
+            "warnings": self.warnings,
+        }
+
     def finish(self, payload: dict[str, Any], lines: Sequence[str]) -> None:
-        """Print the result and the warnings: one JSON object, or lines of text."""
+        """Print the result, the times and the warnings: one JSON object, or lines of text."""
         lines = [*(f"warning: {text}" for text in self.warnings), *lines]
         if self.as_json:
-            sys.stdout.write(dump_json({**payload, "warnings": self.warnings}, indent=None))
+            sys.stdout.write(dump_json({**payload, **self.about()}, indent=None))
         else:
             sys.stdout.write("\n".join(lines) + "\n")
         sys.stdout.flush()
@@ -114,19 +121,7 @@ class Console:
 
 def dump_json(payload: dict[str, Any], indent: int | None = 1) -> str:
     """Return strict JSON text with a final newline; NaN and infinities become null."""
-    return json.dumps(_jsonable(payload), indent=indent, allow_nan=False) + "\n"
-
-
-def _jsonable(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {str(k): _jsonable(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_jsonable(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, Path) else value
+    return json.dumps(jsonable(payload), indent=indent, allow_nan=False) + "\n"
 
 
 @contextmanager

@@ -52,8 +52,6 @@ def run_query(command: Command, console: Console) -> int:
         "q": q,
         "joint_names": list(robot.joint_names),
         "base_pose": robot.base_pose,
-        "timings": console.timings,
-        "compile_seconds": console.compile_seconds,
     }
     rows = len(margins.margins) if command.rows == 0 else max(command.rows, 0)
     known = "none, the robot is nowhere near what the map knows"
@@ -127,7 +125,6 @@ def run_robot(command: Command, console: Console) -> int:
         "upper": robot.upper,
         "continuous": robot.continuous,
         "seconds": time.perf_counter() - began,
-        "timings": console.timings,
         "written": written,
     }
     lines = [
@@ -178,7 +175,6 @@ def run_view(command: Command, console: Console) -> int:
     try:
         shown = sorted({path.split("/")[1] for path in viewer.nodes})
         payload: dict[str, Any] = {"url": viewer.url, "shown": shown, "nodes": sorted(viewer.nodes)}
-        payload["timings"] = console.timings
         payload["risk"] = None if viewer.risk is None else viewer.risk.to_dict()
         payload["next_view"] = None if look is None else look.text()
         lines = [f"{command.input}: {', '.join(shown)}"]

@@ -107,8 +107,6 @@ def run_map(command: Command, console: Console) -> int:
         "segmented": segmented,
         "aligned": "align" in console.timings,
         "seed": command.seed,
-        "timings": console.timings,
-        "compile_seconds": console.compile_seconds,
     }
     how = " (segmented from geometry)" if segmented else ""
     lines = [
@@ -149,8 +147,6 @@ def run_mesh(command: Command, console: Console) -> int:
         "output": command.output,
         "objects": objects,
         "without_surface": missing,
-        "timings": console.timings,
-        "compile_seconds": console.compile_seconds,
     }
     console.finish(payload, lines)
     return 0 if meshes else 1
@@ -159,11 +155,11 @@ def run_mesh(command: Command, console: Console) -> int:
 def run_export(command: Command, console: Console) -> int:
     """Write the world or the trajectory; exit code 0."""
     if command.input.suffix == ".json":
-        from vprism_plan.planning.trajectory import read_trajectory, write_message
+        from vprism_plan.planning.trajectory import read_trajectory, write_trajectory
 
         names, trajectory = read_trajectory(command.input)
         with console.stage("export"):
-            write_message(command.output, names, trajectory, command.frame_id)
+            write_trajectory(command.output, names, trajectory, command.frame_id)
     else:
         from vprism_plan.world import World, WorldConfig
 
@@ -179,6 +175,6 @@ def run_export(command: Command, console: Console) -> int:
         with console.stage("export"):
             world.export(command.output, command.frame_id)
     size = command.output.stat().st_size
-    payload = {"output": command.output, "bytes": size, "timings": console.timings}
+    payload = {"output": command.output, "bytes": size}
     console.finish(payload, [console.time_line(), f"wrote {command.output} ({size / 1e6:.2f} MB)"])
     return 0

@@ -2,8 +2,6 @@
 """The commands `plan` and `demo`: a query, its answer, pictures, files and lines on both."""
 
 from collections.abc import Callable
-from dataclasses import fields
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -106,7 +104,7 @@ def run_plan(command: Command, console: Console) -> int:
             "give --base-xyz, --start and --goal"
         )
         plan = {"status": "no_place", "message": message}
-        payload = {"solved": False, "plan": plan, "timings": console.timings}
+        payload = {"solved": False, "plan": plan}
         console.finish(payload, [f"no safe answer (no_place): {message}"])
         return 1
     given = {"base": command.base_xyz, "start": command.start}
@@ -179,6 +177,7 @@ def solve(
     objects (N, 3) -> (N,), metres, where it is known: for pictures and the report only.
     """
     from vprism_plan.planning import plan, time_parameterize, write_trajectory
+    from vprism_plan.planning.path import interpolated
 
     options = {"planner": command.planner, "time_limit": command.time_limit, "seed": command.seed}
     with console.stage("plan"):
@@ -204,9 +203,7 @@ def solve(
             "plan": {
                 "status": result.status,
                 "message": result.message,
-                **{field.name: getattr(report, field.name) for field in fields(report)},
-                "risk": None if report.risk is None else report.risk.to_dict(),
-                "allowed_contacts": [contact.to_dict() for contact in report.allowed_contacts],
+                **report.to_dict(),
             },
             "explanation": None if result.explanation is None else result.explanation.text(),
             "map": describe_map(world.map),
@@ -220,15 +217,12 @@ def solve(
                 },
             },
             "meshes": {str(i): {"triangles": len(mesh.faces)} for i, mesh in meshes.items()},
-            "timings": console.timings,
-            "compile_seconds": console.compile_seconds,
-            "compiled_kernels": console.compiled,
         }
         if path is not None:
             timed = time_parameterize(robot, path, checker=checker)
             write_trajectory(aside / "trajectory.json", robot, timed, frame_id="world")
             payload["trajectory"] = {"duration": timed.duration, "points": len(timed.times)}
-            dense = dense_path(path, 0.01)
+            dense = interpolated(path, 0.01)
             clearance = checker.clearance_batch(dense)
             shown = np.linspace(0, len(dense) - 1, min(_PROFILE, len(dense))).astype(int)
             extremes = {"minimum": float(clearance.min()), "mean": float(clearance.mean())}
@@ -238,7 +232,8 @@ def solve(
                 payload["truth"] = true_distance(robot, path, truth)
         files = {p.relative_to(aside): p for p in sorted(aside.rglob("*")) if p.is_file()}
         payload["sizes"] = {str(name): file.stat().st_size for name, file in files.items()}
-        (aside / "report.json").write_text(dump_json(payload), encoding="utf-8")
+        text = dump_json(payload | console.about())
+        (aside / "report.json").write_text(text, encoding="utf-8")
         written = sorted({"report.json", *(name.parts[0] for name in files)})
     payload["output"] = command.output
     wrote = f"wrote {command.output}/: {', '.join(written)}"
@@ -265,22 +260,15 @@ def _draw(
         save_figure(figure, folder / "plan.png")
 
 
-def dense_path(path: np.ndarray, step: float) -> np.ndarray:
-    """Return a path with configurations at most `step` apart in every joint, corners kept."""
-    pieces = [path[:1]]
-    for a, b in pairwise(path):
-        count = max(1, int(np.ceil(np.abs(b - a).max() / step)))
-        pieces.append(a + np.linspace(0.0, 1.0, count + 1)[1:, None] * (b - a))
-    return np.concatenate(pieces)
-
-
 def true_distance(robot: "Robot", path: np.ndarray, truth: Distance) -> dict[str, Any]:
     """Return the smallest distance of the moving spheres to the real objects, metres.
 
     Also how far any sphere moves between two samples, which bounds what they can miss.
     """
+    from vprism_plan.planning.path import interpolated
+
     moving = np.flatnonzero(~np.asarray(robot.fixed_links)[np.asarray(robot.sphere_links)])
-    dense = dense_path(path, 0.0015)
+    dense = interpolated(path, 0.0015)
     gaps, places = [], []
     for begin in range(0, len(dense), 256):
         centers = robot.sphere_centers(dense[begin : begin + 256])[:, moving]

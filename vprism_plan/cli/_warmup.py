@@ -25,7 +25,7 @@ def run_warmup(command: Command, console: Console) -> int:
         failed = [job for job, process in running.items() if process.wait() != 0]
     if failed:
         raise VPrismError(f"compiling the kernels of {' and '.join(failed)} failed; see above")
-    console.finish({"timings": console.timings}, [f"kernels are compiled; {console.time_line()}"])
+    console.finish({}, [f"kernels are compiled; {console.time_line()}"])
     return 0
 
 

@@ -2,7 +2,6 @@
 """The collision checker: a robot's spheres against a world that knows what it has not seen."""
 
 import copy
-import threading
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
@@ -28,6 +27,7 @@ from vprism_plan.collision.packing import (
     pack_robot,
     pack_world,
     waypoints,
+    wider,
 )
 from vprism_plan.collision.reports import Contact, MotionReport, RiskEstimate
 from vprism_plan.collision.risk import PathRisk, Setting, make_setting
@@ -37,13 +37,6 @@ from vprism_plan.world.grid import Chosen, Values
 _BATCH_CHUNK = 512
 _CHORD = 0.002  # metres that anything moves along a chord of a rounded corner, at most
 _ROUNDING = 1e-9  # metres: gaps below it come from rounding, not from sampling
-
-
-def _wider(world: PackedWorld, extra: float) -> PackedWorld:
-    distance, blocks, floats = world
-    floats = floats.copy()
-    floats[MARGIN] += extra
-    return distance, blocks, floats
 
 
 class _AnyDraw:
@@ -116,32 +109,22 @@ class CollisionChecker(explain.Checker):
         self.robot = robot
         self.config = CheckerConfig() if config is None else config
         self._rules, self._link_rules = contact_rules(robot, self.config.allowed_contacts)
-        packed = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
-        self._rf, self._ri = packed.floats, packed.ints
-        self._fields = [world.field]
-        self._fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
+        self._rf, self._ri = pack_robot(robot.arrays, self.config.self_margin, self._link_rules)
+        # What verdicts go by, under each contact rule.
+        self.fields = [world.field]
+        self.fields += [self._ruled_world().fields_without(ids) for ids in self._rules[1:]]
         # What `clearance` is measured to; verdicts are given by `_world`.
-        self._surfaces = pack_world(world, self._fields, self.config.margin)
+        self._surfaces = pack_world(world, self.fields, self.config.margin)
         self._world = self._surfaces
-        self._lock = threading.Lock()
-        self._path_risk: PathRisk | None = None
         self._bounded: PathRisk | None = None  # set when verdicts need it
         self._draws: Any = None
         posterior = hasattr(world, "certain_field") and hasattr(world.map, "sample_weights")
         if self.config.max_risk is not None and posterior:
-            self._bounded = self._risk()
+            self._bounded = self._path_risk
             self._draws = _AnyDraw(self._bounded.setting)
             if self.config.max_risk >= world.config.level:
-                self._fields, self._world = self._what_was_seen
+                self.fields, self._world = self._what_was_seen
         self._warm_up()
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Every copy, in this process or another, has a lock of its own."""
-        self.__dict__.update(state)
-        self._lock = threading.Lock()
 
     @cached_property
     def _what_was_seen(self) -> tuple[list[Any], PackedWorld]:
@@ -281,7 +264,7 @@ class CollisionChecker(explain.Checker):
         number("extra", extra, 0.0, unit="metres: a margin can only be widened")
         other = self._with(
             config=replace(self.config, margin=self.config.margin + extra),
-            _world=_wider(self._world, extra),
+            _world=wider(self._world, extra),
         )
         vars(other).pop("_what_was_seen", None)  # packed with the margin
         return other
@@ -295,7 +278,7 @@ class CollisionChecker(explain.Checker):
         config = replace(self.config, max_risk=max_risk)
         fields, world = self._what_was_seen
         bounded = self._bounded.bounded_by(config)
-        return self._with(config=config, _bounded=bounded, _fields=fields, _world=world)
+        return self._with(config=config, _bounded=bounded, fields=fields, _world=world)
 
     def _with(self, **changes: Any) -> "CollisionChecker":
         other = copy.copy(self)
@@ -321,7 +304,7 @@ class CollisionChecker(explain.Checker):
 
     def verdict_field(self, link: int) -> Any:
         """Return the distance field that verdicts check a link (index) against."""
-        return self._fields[int(self._link_rules[link])]
+        return self.fields[int(self._link_rules[link])]
 
     def allowed_objects(self, link: int) -> frozenset[int]:
         """Return the ids of the objects that a link (index) may touch."""
@@ -396,8 +379,8 @@ class CollisionChecker(explain.Checker):
         mild.
         """
         rows = waypoints(self.robot, path, single=True)
-        risk = self._risk()
-        return (risk.held_out() if held_out else risk).estimate(rows)
+        risk = self._path_risk
+        return (risk.held_out if held_out else risk).estimate(rows)
 
     def _ruled_world(self) -> Any:
         if not hasattr(self.world, "certain_field"):
@@ -407,17 +390,13 @@ class CollisionChecker(explain.Checker):
             )
         return self.world
 
-    def _risk(self) -> PathRisk:
-        with self._lock:
-            if self._path_risk is None:
-                self._path_risk = PathRisk(
-                    make_setting(
-                        self._ruled_world(), self.robot, self.config, self._rules, self._link_rules
-                    )
-                )
-            return self._path_risk
+    @cached_property
+    def _path_risk(self) -> PathRisk:
+        """Made when it is asked for; if two threads ask at once, twice, of the same draws."""
+        world = self._ruled_world()
+        return PathRisk(make_setting(world, self.robot, self.config, self._rules, self._link_rules))
 
     def risk_setting(self, held_out: bool = False) -> Setting:
         """Return what probabilities are counted with; `held_out` as in `collision_probability`."""
-        risk = self._risk()
-        return (risk.held_out() if held_out else risk).setting
+        risk = self._path_risk
+        return (risk.held_out if held_out else risk).setting

@@ -101,14 +101,9 @@ def contact_rules(
         RobotError: no such link or group.
     """
     names = list(robot.link_names)
-    per_link: list[set[int]] = [set() for _ in names]
+    own = [frozenset[int]()] * len(names)
     for name, ids in allowed.items():
         for link in robot.links_of(name):
-            per_link[names.index(link)].update(int(i) for i in ids)
-    rules = [frozenset[int]()]
-    index = np.zeros(len(names), dtype=np.int64)
-    for link, own in enumerate(map(frozenset, per_link)):
-        if own not in rules:
-            rules.append(own)
-        index[link] = rules.index(own)
-    return rules, index
+            own[names.index(link)] |= frozenset(map(int, ids))
+    rules = list(dict.fromkeys([frozenset[int](), *own]))
+    return rules, np.array([rules.index(ids) for ids in own], dtype=np.int64)

@@ -11,6 +11,7 @@ from vprism_plan._arguments import number
 from vprism_plan.collision.explain import unit_ball_points
 from vprism_plan.collision.motion import edges_of, place_points
 from vprism_plan.collision.packing import Numbers, Rows, Waypoints
+from vprism_plan.collision.reports import Answer
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses
 from vprism_plan.world.grid import Chosen, Index, Points
@@ -21,7 +22,7 @@ _CHUNK = 1 << 20  # voxel candidates in memory at once
 
 
 @dataclass(frozen=True)
-class PathEntropy:
+class PathEntropy(Answer):
     """Answer of `path_entropy`; nats. Only links that joints move count.
 
     The map's entropy means something where it has support (kernel mass at least
@@ -66,16 +67,6 @@ class PathEntropy:
             f"{1000 * self.swept_volume:.1f} l swept (total {1000 * self.swept_total:.3f} l nats, "
             f"voxels of {1000 * self.resolution:g} mm)"
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values; null where nothing is supported."""
-
-        def plain(value: Any) -> Any:
-            if isinstance(value, tuple):
-                return [plain(v) for v in value]
-            return None if np.isnan(value) else value
-
-        return {name: plain(value) for name, value in vars(self).items()}
 
 
 def path_entropy(checker: Any, q_or_path: Numbers, resolution: float = 0.01) -> PathEntropy:
@@ -167,11 +158,20 @@ def swept_voxels(checker: Any, Q: Rows, resolution: float) -> Int[np.ndarray, "v
     """Voxels (centres at resolution * (i, j, k), world, metres), each once, whose centre lies in
     a sphere of a moving link at some row of Q; RobotError if they would be too many."""
     centers, radii = _moving(checker, Q)
+    ways = [_thinned(way, 0.5 * resolution) for way in np.moveaxis(centers, 1, 0)]
+    places = np.concatenate([np.empty((0, 3)), *ways])
+    return voxels_in(places, np.repeat(radii, [len(way) for way in ways]), resolution)
+
+
+def voxels_in(
+    centers: Points, radii: Float[np.ndarray, " n"], resolution: float
+) -> Int[np.ndarray, "v 3"]:
+    """The same for any balls."""
     if len(radii) == 0:
         return np.empty((0, 3), dtype=np.int64)
     grown = radii[:, None] + 2.0 * resolution
-    low = np.floor((centers - grown).min(axis=(0, 1)) / resolution).astype(np.int64)
-    high = np.ceil((centers + grown).max(axis=(0, 1)) / resolution).astype(np.int64)
+    low = np.floor((centers - grown).min(axis=0) / resolution).astype(np.int64)
+    high = np.ceil((centers + grown).max(axis=0) / resolution).astype(np.int64)
     shape = tuple(int(n) for n in high - low + 1)
     if float(np.prod(high - low + 1.0)) > _MAX_CELLS:
         raise RobotError(
@@ -179,8 +179,8 @@ def swept_voxels(checker: Any, Q: Rows, resolution: float) -> Int[np.ndarray, "v
             f"{' x '.join(map(str, shape))} (at most {_MAX_CELLS:,}); give a coarser resolution"
         )
     swept = np.zeros(shape, dtype=bool)
-    for s, radius in enumerate(radii):
-        _stamp(swept, low, _thinned(centers[:, s], 0.5 * resolution), float(radius), resolution)
+    for radius in np.unique(radii).tolist():
+        _stamp(swept, low, centers[radii == radius], radius, resolution)
     return np.argwhere(swept) + low
 
 

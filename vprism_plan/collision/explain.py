@@ -19,7 +19,7 @@ from vprism_plan.collision.reports import Contact, Kind, StateReport, as_point
 from vprism_plan.robots.kinematics import outside_limits
 from vprism_plan.world.grid import Balls, Points, Values, Vector, window
 from vprism_plan.world.sources import policies, source_of
-from vprism_plan.world.visibility import UNSEEN, free_balls
+from vprism_plan.world.visibility import OCCLUDED, OUTSIDE, SEEN, UNSEEN, free_balls
 
 # Signed distance, metres; where, world; unit direction that leads out.
 Touch = tuple[Any, Vector, Vector]
@@ -110,16 +110,27 @@ def by_depth(contacts: Iterable[Contact]) -> list[Contact]:
 
 
 def volume_shares(
-    world: Any, robot: Any, centers: Float[np.ndarray, "n s 3"], ball: Points
+    world: Any,
+    robot: Any,
+    centers: Float[np.ndarray, "n s 3"],
+    ball: Points,
+    judged: bool = False,
 ) -> dict[str, Values]:
     """Return which share of the moving links' sphere volume lies in space nobody has seen, by
-    points of the unit ball in each sphere."""
+    points of the unit ball in each sphere. With `judged` it is space that the map cannot judge:
+    hidden space that it has something to say of is left out, all beyond the grid counts."""
     moving = ~np.asarray(robot.arrays.link_fixed)[robot.sphere_links]
     if not moving.any():
         return {name: np.zeros(len(centers)) for name in UNSEEN.values()}
     centers, radii = centers[:, moving], robot.sphere_radii[moving]
-    points = centers[:, :, None] + radii[:, None, None] * ball
-    status = np.asarray(world.status(points.reshape(-1, 3))).reshape(points.shape[:3])
+    points = (centers[:, :, None] + radii[:, None, None] * ball).reshape(-1, 3)
+    status = np.asarray(world.status(points))
+    if judged:
+        hidden = np.flatnonzero(status == OCCLUDED)
+        status[hidden[world.map.judges(points[hidden], world.config.min_support)]] = SEEN
+        beyond = (points < world.field.origin) | (points > world.field.upper)
+        status[beyond.any(axis=1)] = OUTSIDE
+    status = status.reshape(*centers.shape[:2], -1)
     weight = radii**3 / np.sum(radii**3)
     return {name: np.mean(status == k, axis=2) @ weight for k, name in UNSEEN.items()}
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from vprism_plan.collision.motion import edges_of, joint_units, place_points, sphere_jacobians
 from vprism_plan.collision.packing import Numbers, Rows, checked_tolerance, configurations
-from vprism_plan.collision.reports import Kind
+from vprism_plan.collision.reports import Answer, Kind
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import frame_poses, joint_values
 from vprism_plan.world.distance import DistanceField
@@ -21,7 +21,7 @@ _CHUNK = 512  # configurations whose spheres are in memory at once
 
 
 @dataclass(frozen=True)
-class BodyMargin:
+class BodyMargin(Answer):
     """Where one link and one obstacle are nearest to each other; metres, world frame.
 
     Attributes:
@@ -55,13 +55,9 @@ class BodyMargin:
     allowed: bool = False
     place: float = 0.0
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
-class SafetyMargins:
+class SafetyMargins(Answer):
     """Answer of `safety_margin`: every moving link against every obstacle.
 
     Attributes:
@@ -136,10 +132,6 @@ class SafetyMargins:
             "-" if margin.entropy is None else f"{margin.entropy:.2f}",
             joint if abs(slope) >= 0.5 else "-",
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        return {**self.__dict__, "margins": [margin.to_dict() for margin in self.margins]}
 
 
 @dataclass(frozen=True, eq=False)

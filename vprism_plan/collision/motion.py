@@ -21,7 +21,7 @@ from vprism_plan.collision.packing import (
     reach_table,
     waypoints,
 )
-from vprism_plan.collision.reports import StateReport
+from vprism_plan.collision.reports import Answer, StateReport
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, frame_poses
 from vprism_plan.world.grid import Points, Values
@@ -127,7 +127,7 @@ def sphere_jacobians(
 
 
 @dataclass(frozen=True)
-class PathClearance:
+class PathClearance(Answer):
     """Answer of `min_clearance`; metres.
 
     Attributes:
@@ -154,13 +154,9 @@ class PathClearance:
             f"({self.configurations} configurations)"
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        return dict(vars(self))
-
 
 @dataclass(frozen=True)
-class SafeMotion:
+class SafeMotion(Answer):
     """Answer of `max_safe_motion`.
 
     Attributes:
@@ -193,11 +189,6 @@ class SafeMotion:
             f"safe up to {self.fraction:.4f} of it (up to {1000 * self.distance:.1f} mm of "
             f"motion, to within {1000 * self.tolerance:.2f} mm): {self.reason.text()}"
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        reason = None if self.reason is None else self.reason.to_dict()
-        return {**self.__dict__, "reason": reason}
 
 
 def min_clearance(checker: Any, path: Numbers, tolerance: float = 0.0005) -> PathClearance:

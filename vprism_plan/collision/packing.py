@@ -8,7 +8,6 @@ anything is computed from them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,17 +33,11 @@ AT_MOST = 200_000  # configurations that one query may ask about
 # An array, a tensor, a list or a tuple; of one configuration also values by name.
 Numbers = ArrayLike | Sequence[Any] | Named
 
+# Kernel view of a robot, floats and integers: `vprism_plan._kernels.checking` has the layout.
+PackedRobot = tuple[Float[np.ndarray, "f"], Int[np.ndarray, "i"]]
 # Kernel view of a world: distances at nodes and in blocks (metres, float32), (rules, x, y, z)
 # each, and the grid, plane and margin data.
 PackedWorld = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True)
-class PackedRobot:
-    """Kernel view of a robot; the layout is documented in `vprism_plan._kernels.checking`."""
-
-    floats: Float[np.ndarray, "f"]
-    ints: Int[np.ndarray, "i"]
 
 
 def _rotation_from_z(axis: Vector) -> Float[np.ndarray, "3 3"]:
@@ -161,7 +154,7 @@ def pack_robot(
     header[16:22] = np.cumsum([0, *[part.size for part in float_parts[:-1]]])
     floats = np.concatenate([part.reshape(-1) for part in float_parts], dtype=np.float64)
     ints = np.concatenate([header, *[part.reshape(-1) for part in int_parts]], dtype=np.int64)
-    return PackedRobot(floats, ints)
+    return floats, ints
 
 
 def _turned(
@@ -203,6 +196,14 @@ def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
     floats = np.concatenate([head, far], dtype=np.float64)
     distance = np.ascontiguousarray([f.distance for f in fields], dtype=np.float32)
     blocks = np.ascontiguousarray([block_bounds(d, float(field.spacing)) for d in distance])
+    return distance, blocks, floats
+
+
+def wider(world: PackedWorld, extra: float) -> PackedWorld:
+    """Return a packed world from which `extra` metres more are to be kept."""
+    distance, blocks, floats = world
+    floats = floats.copy()
+    floats[MARGIN] += extra
     return distance, blocks, floats
 
 

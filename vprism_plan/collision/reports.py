@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from vprism_plan._files import jsonable
 from vprism_plan.world.grid import Vector
 from vprism_plan.world.sources import SourceKind, spoken
 
@@ -25,8 +26,16 @@ def as_point(values: Vector) -> Point:
     return x, y, z
 
 
+class Answer:
+    """A dataclass that can become JSON: of numbers, text, and others of its kind."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return JSON-ready values; null where a number is not finite."""
+        return {name: jsonable(v) for name, v in vars(self).items() if not callable(v)}
+
+
 @dataclass(frozen=True)
-class Contact:
+class Contact(Answer):
     """One reason why a configuration is refused; metres, world frame.
 
     Attributes:
@@ -80,17 +89,18 @@ class Contact:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready keys of moveit_msgs/ContactInformation, and ours."""
+        values = super().to_dict()
         return {
-            "contact_body_1": self.link,
+            "contact_body_1": values.pop("link"),
             "body_type_1": _ROBOT_LINK,
-            "contact_body_2": self.body,
+            "contact_body_2": values.pop("body"),
             "body_type_2": _ROBOT_LINK if self.kind == "self" else _WORLD_OBJECT,
-            **{name: vars(self)[name] for name in vars(self) if name not in {"link", "body"}},
+            **values,
         }
 
 
 @dataclass(frozen=True)
-class StateReport:
+class StateReport(Answer):
     """Why a configuration is accepted or refused.
 
     Attributes:
@@ -133,22 +143,17 @@ class StateReport:
         """Return JSON-ready keys of moveit_msgs/GetStateValidity (valid, contacts,
         cost_sources), and ours. A cost source's cost is the map's P(occupied)."""
         return {
-            **vars(self),
-            "contacts": [contact.to_dict() for contact in self.contacts],
+            **super().to_dict(),
             "cost_sources": [
                 {"cost_density": c.probability, "aabb_center": c.position, "contact_body": c.body}
                 for c in self.contacts
                 if c.probability is not None
             ],
-            "shares": dict(self.shares),
-            "policies": dict(self.policies),
-            "allowed": [contact.to_dict() for contact in self.allowed],
-            "warnings": list(self.warnings),
         }
 
 
 @dataclass(frozen=True)
-class FirstContact:
+class FirstContact(Answer):
     """What a path touches first, in some of the worlds where it touches anything.
 
     Attributes:
@@ -172,7 +177,7 @@ class FirstContact:
 
 
 @dataclass(frozen=True, eq=False)
-class RiskEstimate:
+class RiskEstimate(Answer):
     """The joint probability that a path collides, over worlds drawn from the posterior.
 
     Attributes:
@@ -246,15 +251,9 @@ class RiskEstimate:
         return line
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready keys."""
-        found = {name: value for name, value in vars(self).items() if not callable(value)}
-        return {
-            **found,
-            "per_waypoint": [float(p) for p in self.per_waypoint],
-            "first_contact": [vars(cause) for cause in self.first_contact],
-            "unsupported_share": self.unsupported_share,
-            "shares": dict(self.shares),
-        }
+        """Return JSON-ready values, what is left to find among them."""
+        found = {name: getattr(self, name) for name in ("first_contact", "shares")}
+        return super().to_dict() | jsonable(found | {"unsupported_share": self.unsupported_share})
 
 
 @dataclass(frozen=True)

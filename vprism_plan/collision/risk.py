@@ -16,26 +16,24 @@ from scipy.special import betaincinv
 
 from vprism_plan._kernels import checking, risk
 from vprism_plan.collision.config import CheckerConfig
-from vprism_plan.collision.explain import nearest_source
+from vprism_plan.collision.explain import nearest_source, unit_ball_points, volume_shares
 from vprism_plan.collision.packing import (
     AT_MOST,
-    MARGIN,
     Configuration,
     Rows,
     Waypoints,
     pack_robot,
     pack_world,
+    wider,
 )
 from vprism_plan.collision.reports import Contact, FirstContact, RiskEstimate, as_point
 from vprism_plan.errors import ConfigError, RobotError
 from vprism_plan.world import PosteriorWorlds
 from vprism_plan.world.grid import Chosen
 from vprism_plan.world.posterior_worlds import MAX_REACH
-from vprism_plan.world.visibility import OCCLUDED, OUTSIDE, SEEN, UNSEEN
 
 _HELD_OUT = 1_000_003  # added to the seed of the draws
-_ONE = np.zeros(1, np.int64)
-_MAX_SAMPLES = 64
+_MAX_SAMPLES, _POINTS = 64, 8  # of a path, and in each ball at these, for what nobody has seen
 # Voxels by which spheres may grow when no world may collide any more (`PathRisk.tightened`).
 PADDINGS = (0.5, 1.0, 2.0)
 # Voxels by which a draw's surface may lie off where its voxels put it.
@@ -90,10 +88,7 @@ class Setting:
     @cached_property
     def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The same for the kernels, with the margin: distances, block bounds, floats."""
-        distance, blocks, floats = self.certain.packed
-        floats = floats.copy()
-        floats[MARGIN] += self.margin
-        return distance, blocks, floats
+        return wider(self.certain.packed, self.margin)
 
 
 def grown(setting: Setting, voxels: float) -> Setting:
@@ -123,13 +118,13 @@ def make_setting(
     tables = np.array([worlds.rule(ids) for ids in rules], dtype=np.int64)
     per_link = np.where(arrays.link_fixed, -1, tables[link_rules])
     alone = replace(arrays, pairs=np.empty((0, 2), np.int64))
-    packed = pack_robot(alone, rules=link_rules)
-    limits = packed.floats[packed.ints[19] :][: 2 * packed.ints[4]]
+    floats, ints = pack_robot(alone, rules=link_rules)
+    limits = floats[ints[19] :][: 2 * ints[4]]
     limits[0::2], limits[1::2] = -np.inf, np.inf  # whatever the joint values, spheres collide
     spacing = min(resolution, 0.5 * float(world.map.kernel_length))
     return Setting(
         world, robot, config, worlds, radii, tables, per_link[arrays.sphere_link].astype(np.int64),
-        Certain(world, rules), packed.floats, packed.ints, spacing,
+        Certain(world, rules), floats, ints, spacing,
     )  # fmt: skip
 
 
@@ -317,7 +312,6 @@ class PathRisk:
         # Where something may be touched, a voxel said to be its own may hide another object.
         hidden = worlds.error_free + (worlds.error_occupied if any(rules) else 0.0)
         self._upper = np.minimum(upper + hidden, 1.0)
-        self._held_out: PathRisk | None = None
         self._lost = np.zeros(config.n_worlds, np.bool_)  # worlds that no verdict counts
         self.allowed = 0
         if config.max_risk is not None:
@@ -348,15 +342,14 @@ class PathRisk:
         stricter.allowed = left >> min(level, halvings)
         return stricter
 
+    @cached_property
     def held_out(self) -> "PathRisk":
-        """Return the same with worlds that no verdict has seen."""
-        if self._held_out is None:
-            other = copy.copy(self)
-            worlds = self.setting.worlds
-            other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
-            other._blurred = grown(other.setting, BLUR)
-            self._held_out = other
-        return self._held_out
+        """The same with worlds that no verdict has seen."""
+        other = copy.copy(self)
+        worlds = self.setting.worlds
+        other.setting = replace(self.setting, worlds=worlds.redrawn(worlds.seed + _HELD_OUT))
+        other._blurred = grown(other.setting, BLUR)
+        return other
 
     def accepts(self, path: Waypoints) -> bool:
         """Whether few enough worlds come within the margin anywhere on a path, certain
@@ -440,57 +433,19 @@ class PathRisk:
             spacing=at.spacing,
             configurations=len(sweep.centers),
             trace=lambda: first_contacts(at, path, sweep, edge, float(stats[0])),
-            volume=lambda: self._codes.shares(sweep.centers, at.radii, at.sphere_tables),
+            volume=lambda: self._unjudged(sweep.centers),
         )
 
-    @cached_property
-    def _codes(self) -> "SpaceCodes":
-        return SpaceCodes(self.setting.world)
-
-
-class SpaceCodes:
-    """What is known of the space around each node of a world's grid, by the codes of
-    `visibility`: SEEN also where it is hidden and the map has support. Judged when first asked for,
-    one byte per node."""
-
-    def __init__(self, world: Any) -> None:
-        self._world = world
-        self._codes = np.full(world.field.distance.shape, risk.NOT_JUDGED, np.uint8)
-
-    def _judge(self, nodes: Int[np.ndarray, " n"]) -> None:
-        world = self._world
-        index = np.stack(np.unravel_index(nodes, self._codes.shape), axis=1)
-        points = world.field.origin + world.field.spacing * index
-        codes = np.asarray(world.status(points)).astype(np.uint8)
-        codes[codes == OUTSIDE] = SEEN  # rounding at the faces
-        hidden = np.flatnonzero(codes == OCCLUDED)
-        judged = world.map.judges(points[hidden], world.config.min_support)
-        codes[hidden[judged]] = SEEN
-        self._codes.reshape(-1)[nodes] = codes
-
-    def shares(
-        self,
-        centers: Float[np.ndarray, "n 3 s"],
-        radii: Float[np.ndarray, " s"],
-        rules: Int[np.ndarray, " s"],
-    ) -> dict[str, float]:
-        """Return the share of the swept volume that lies in each kind of space not judged: seven
-        points per ball (its centre and six at three fifths of the radius), balls weighted by
-        volume, over at most 64 samples spread along the path; none of balls with rule -1."""
-        n, field = len(centers), self._world.field
-        chosen = _ONE if n == 1 else np.arange(m := min(n, _MAX_SAMPLES)) * (n - 1) // (m - 1)
-        missing = np.empty(7 * len(chosen) * len(radii), np.int64)
-        while True:
-            totals = np.zeros(4)
-            count = risk.volume_codes(
-                centers, chosen, radii, rules, self._codes, field.origin, float(field.spacing),
-                totals, missing,
-            )  # fmt: skip
-            if not count:
-                break
-            self._judge(np.unique(missing[:count]))
-        whole = max(float(totals.sum()), 1e-300)
-        return {name: float(totals[code]) / whole for code, name in UNSEEN.items()}
+    def _unjudged(self, centers: Float[np.ndarray, "n 3 s"]) -> dict[str, float]:
+        """Share of the swept volume in each kind of space that the map cannot judge, over at most
+        64 samples spread along the path."""
+        n, at = len(centers), self.setting
+        some = np.unique(np.linspace(0, n - 1, min(n, _MAX_SAMPLES)).astype(np.int64))
+        ball = unit_ball_points(_POINTS, surface=False)
+        shares = volume_shares(
+            at.world, at.robot, centers[some].transpose(0, 2, 1), ball, judged=True
+        )
+        return {kind: float(own.mean()) for kind, own in shares.items()}
 
 
 def clopper_pearson(

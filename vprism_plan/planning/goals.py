@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from vprism_plan._arguments import number, rigid_pose, whole
+from vprism_plan.collision.explain import limit_contacts
 from vprism_plan.errors import PlanningError, RobotError
 from vprism_plan.planning._inverse_kinematics import Targets, Tip, descend, find_tip
 from vprism_plan.planning.ompl_adapter import nearest_turns
@@ -246,17 +247,11 @@ def numbers(values: Any, robot: Any, what: str) -> Float[np.ndarray, "..."]:
 
 def _refusal(checker: CheckerLike, q: Configuration) -> tuple[str, Any] | None:
     """Why q must not be used, and the checker's report on it; None if it may be."""
-    robot = checker.robot
-    # Outside the limits OMPL would refuse without a reason.
-    bad = outside_limits(robot, q)
-    if not bad.any() and checker.is_valid(q):
+    limits = limit_contacts(checker.robot, q)  # outside them OMPL would refuse without a reason
+    if not limits and checker.is_valid(q):
         return None
-    outside = ", ".join(
-        f"joint {robot.joint_names[i]} is {q[i]:.6g}, outside [{robot.lower[i]:.6g}, "
-        f"{robot.upper[i]:.6g}] by {max(robot.lower[i] - q[i], q[i] - robot.upper[i]):.3g}"
-        for i in np.flatnonzero(bad)
-    )
     explanation = checker.explain(q)
+    outside = ", ".join(contact.text() for contact in limits)
     return outside if explanation.valid else one_line(explanation), explanation
 
 
@@ -322,17 +317,16 @@ def valid_goals(
         )
         return PlanResult(None, "invalid_goal", report, message)
     good: list[np.ndarray] = []
-    refused: list[PlanResult] = []
     notes: list[RefusedGoal] = []
+    explanations: list[Any] = []
     most = config.max_goals if what else len(found)  # the caller's own are all kept
     for q in found:
-        refusal = refuse(checker, q, "goal", report)
-        if refusal is None:
+        why = _refusal(checker, q)
+        if why is None:
             good.append(q)
         else:
-            refused.append(refusal)
-            reason = refusal.message.removeprefix("goal is invalid: ")
-            notes.append(RefusedGoal(tuple(q.tolist()), reason))
+            notes.append(RefusedGoal(tuple(q.tolist()), why[0]))
+            explanations.append(why[1])
         if len(good) == most:
             break
     report = replace(report, refused_goals=tuple(notes))
@@ -340,4 +334,4 @@ def valid_goals(
         return np.array(good), report
     said = f"found for the goal {what}" if what else "given as goals"
     message = f"all {len(found)} configurations {said} are invalid, the first: {notes[0].reason}"
-    return replace(refused[0], report=report, message=message)
+    return PlanResult(None, "invalid_goal", report, message, explanation=explanations[0])

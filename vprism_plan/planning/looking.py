@@ -17,6 +17,7 @@ from scipy.special import entr
 
 from vprism_plan._arguments import rigid_pose
 from vprism_plan._kernels import sight
+from vprism_plan.collision.entropy import voxels_in
 from vprism_plan.collision.risk import Setting, count_path
 from vprism_plan.errors import ConfigError, PlanningError
 from vprism_plan.perception.camera import invert_transform, project, transform_points
@@ -178,7 +179,7 @@ def _touches(at: Setting, path: Float[np.ndarray, "t dof"]) -> _Touches:
         centers = sweep.centers[:, :, own].transpose(0, 2, 1).reshape(-1, 3)
         reach = radii[:, own].reshape(-1)
         near = worlds.touched(centers, reach, allowed).any(axis=1)
-        swept = _voxels_in(centers[near] / voxel, reach[near] / voxel + 0.5)
+        swept = voxels_in(centers[near], reach[near] + 0.5 * voxel, voxel)
         taken = counting[rule][worlds.owners(swept)]
         some = taken.any(axis=1)
         index.append(swept[some])
@@ -187,19 +188,6 @@ def _touches(at: Setting, path: Float[np.ndarray, "t dof"]) -> _Touches:
     together = np.zeros((len(voxels), worlds.n_worlds), np.bool_)
     np.logical_or.at(together, which, np.concatenate(occupied))
     return _Touches(voxels, together, sweep.touched > 0)
-
-
-def _voxels_in(
-    centers: Float[np.ndarray, "b 3"], radii: Float[np.ndarray, " b"]
-) -> Int[np.ndarray, "n 3"]:
-    """Return the whole numbers in any ball."""
-    found = [np.empty((0, 3), np.int64)]
-    for center, radius in zip(centers, radii, strict=True):
-        ends = np.ceil(center - radius), np.floor(center + radius) + 1.0
-        axes = [np.arange(a, b, dtype=np.int64) for a, b in zip(*ends, strict=True)]
-        cube = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        found.append(cube[np.linalg.norm(cube - center, axis=1) <= radius])
-    return np.unique(np.concatenate(found), axis=0)
 
 
 def _values(

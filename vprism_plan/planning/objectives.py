@@ -76,7 +76,7 @@ class RiskObjective:
 
     def cost(self, checker: Any) -> "PathCost":
         """Return what paths of a checker's robot cost; draws worlds if nobody has."""
-        return PathCost(checker, self.kind, self.spacing, self.length_weight, self.worst)
+        return PathCost(checker, self)
 
 
 class MotionRisk:
@@ -284,26 +284,17 @@ class _FunctionRisk:
 class PathCost:
     """What motions, and the paths they make up, cost by a risk objective; without OMPL.
 
-    `checker` is a `CollisionChecker` over a `World`, with a function anything with `robot`; the
-    other arguments are those of `RiskObjective`.
+    `checker` is a `CollisionChecker` over a `World`, with a function anything with `robot`.
     """
 
-    def __init__(
-        self,
-        checker: Any,
-        kind: str | Rates = "joint",
-        spacing: float = 0.02,
-        length_weight: float = 1e-3,
-        worst: bool = False,
-    ) -> None:
-        RiskObjective(kind, spacing, length_weight, worst)  # refuses what is out of range
+    def __init__(self, checker: Any, objective: RiskObjective) -> None:
+        kind, spacing = objective.kind, objective.spacing
         self.risk: MotionRisk | _FunctionRisk
         if isinstance(kind, str):
             self.risk = MotionRisk(checker, kind, spacing)
         else:
             self.risk = _FunctionRisk(kind, spacing)
-        self.length_weight = float(length_weight)
-        self.worst = worst
+        self.length_weight, self.worst = float(objective.length_weight), objective.worst
         self._wraps = np.asarray(checker.robot.continuous, dtype=bool)
 
     def edge(self, qa: Configuration, qb: Configuration) -> float:
@@ -392,7 +383,7 @@ class VPrismRiskObjective(_RiskBase):
         length_weight: float = 1e-3,
         cost: PathCost | None = None,
     ) -> None:
-        cost = cost or PathCost(checker, kind, spacing, length_weight)
+        cost = cost or PathCost(checker, RiskObjective(kind, spacing, length_weight))
         super().__init__(si, checker, cost)
         self._length_weight = cost.length_weight
 
@@ -425,7 +416,7 @@ class VPrismMinimaxRiskObjective(_RiskBase):
         spacing: float = 0.02,
         cost: PathCost | None = None,
     ) -> None:
-        cost = cost or PathCost(checker, kind, spacing, 0.0, True)
+        cost = cost or PathCost(checker, RiskObjective(kind, spacing, 0.0, True))
         super().__init__(si, checker, cost)
 
     def motionCost(self, s1: Any, s2: Any) -> Any:  # noqa: N802 - OMPL's name

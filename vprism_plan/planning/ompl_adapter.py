@@ -26,7 +26,7 @@ from jaxtyping import Float
 from ompl import base as ob
 
 from vprism_plan.errors import PlanningError
-from vprism_plan.planning.protocols import CheckerLike, Configuration, RobotLike
+from vprism_plan.planning.protocols import CheckerLike, Configuration
 from vprism_plan.robots.kinematics import joint_values
 
 _TURN = 2.0 * math.pi
@@ -43,7 +43,7 @@ _new_capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
 _STRAIGHT_COMPOUNDS = ("CompoundStateSpace", "SE2StateSpace")
 
 
-def state_space(robot: RobotLike) -> Any:
+def state_space(robot: Any) -> Any:
     """Return the OMPL space of a robot's configurations, with its joint limits.
 
     Without continuous joints it is one `RealVectorStateSpace` (distance: Euclidean,

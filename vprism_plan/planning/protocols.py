@@ -9,37 +9,12 @@ from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 # Radians or metres, in the order of the robot's joints; rows of any number.
 Configuration = Float[np.ndarray, " dof"]
 Waypoints = Float[np.ndarray, "_ dof"]
 Now = Callable[[], float]  # reads a clock, seconds
-
-
-@runtime_checkable
-class RobotLike(Protocol):
-    """The joints of a robot, in one fixed order."""
-
-    @property
-    def dof(self) -> int:
-        """Number of joints that are planned for."""
-
-    @property
-    def joint_names(self) -> Any:
-        """Sequence of dof names, in the order of a configuration."""
-
-    @property
-    def lower(self) -> Float[np.ndarray, " dof"]:
-        """Lower limits, radians or metres; ignored for continuous joints."""
-
-    @property
-    def upper(self) -> Float[np.ndarray, " dof"]:
-        """Upper limits, radians or metres; ignored for continuous joints."""
-
-    @property
-    def continuous(self) -> Bool[np.ndarray, " dof"]:
-        """True where a joint turns without limit."""
 
 
 @runtime_checkable
@@ -54,7 +29,9 @@ class CheckerLike(Protocol):
 
     @property
     def robot(self) -> Any:
-        """The robot, see `RobotLike`."""
+        """The robot: `dof` joints that are planned for, and in one fixed order their `joint_names`,
+        limits `lower` and `upper` (radians or metres; ignored where continuous), and whether they
+        turn without limit, `continuous`."""
 
     def is_valid(self, q: Any) -> bool:
         """Whether configuration q (dof,) is allowed."""
@@ -88,7 +65,7 @@ class SecondOpinion(Protocol):
 
     @property
     def robot(self) -> Any:
-        """The robot, see `RobotLike`."""
+        """The robot, as that of `CheckerLike`."""
 
     def review(self, checker: Any, path: Any) -> Any:
         """An opinion on a path (T, dof) that `checker` accepted: `valid` and `text()`."""

@@ -6,6 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vprism_plan.collision.reports import Answer
+
 Status = Literal[
     "exact", "approximate", "timeout", "invalid_start", "invalid_goal", "verification_failed",
     "too_risky",
@@ -13,7 +15,7 @@ Status = Literal[
 
 
 @dataclass(frozen=True, eq=False)
-class Improvement:
+class Improvement(Answer):
     """The best path at some time of a search.
 
     Attributes:
@@ -29,7 +31,7 @@ class Improvement:
 
 
 @dataclass(frozen=True)
-class RefusedGoal:
+class RefusedGoal(Answer):
     """A configuration q (dof,) that reaches the goal but is invalid; why, by the checker."""
 
     q: tuple[float, ...]
@@ -37,7 +39,7 @@ class RefusedGoal:
 
 
 @dataclass(frozen=True)
-class PlanReport:
+class PlanReport(Answer):
     """The numbers behind a `PlanResult`.
 
     Attributes:

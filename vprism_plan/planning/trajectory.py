@@ -62,13 +62,10 @@ class Trajectory:
         t = np.clip(np.asarray(times, dtype=np.float64), 0.0, self.duration)
         if len(self.times) == 1:
             return self.positions[np.zeros(len(t), int)], self.velocities[np.zeros(len(t), int)]
-        i = np.clip(np.searchsorted(self.times, t, side="right") - 1, 0, len(self.times) - 2)
-        h = (self.times[i + 1] - self.times[i])[:, None]
-        u = (t - self.times[i])[:, None] / h
-        p, q = self.positions[i], self.positions[i + 1]
-        v, w = h * self.velocities[i], h * self.velocities[i + 1]
-        a, b = 3.0 * (q - p) - 2.0 * v - w, 2.0 * (p - q) + v + w
-        return p + u * (v + u * (a + u * b)), (v + u * (2.0 * a + 3.0 * u * b)) / h
+        from scipy.interpolate import CubicHermiteSpline
+
+        motion = CubicHermiteSpline(self.times, self.positions, self.velocities)
+        return motion(t), motion(t, 1)
 
 
 def time_parameterize(
@@ -185,33 +182,28 @@ def _timed(
     rate, cruise = top / ramp, 1.0 / top - ramp
     total = cruise + 2.0 * ramp
 
-    def profile(t: float) -> tuple[float, float]:
-        """s and s' of the trapezoid at time t."""
-        if t <= ramp:
-            return 0.5 * rate * t * t, rate * t
-        if t < total - ramp:
-            return top * (t - 0.5 * ramp), top
-        left = total - t
-        return 1.0 - 0.5 * rate * left * left, rate * left
+    climb = 0.5 * top * ramp  # s at the first knee
 
     def time_at(s: float) -> float:
         """Time at which the trapezoid reaches s."""
-        if s <= 0.5 * top * ramp:
+        if s <= climb:
             return math.sqrt(2.0 * s / rate)
-        if s <= 1.0 - 0.5 * top * ramp:
+        if s <= 1.0 - climb:
             return s / top + 0.5 * ramp
         return total - math.sqrt(2.0 * (1.0 - s) / rate)
 
     inner = np.linalg.norm(line[1:-1] - line[0], axis=1) / np.linalg.norm(whole)
     events = [(time_at(float(s)), q) for s, q in zip(inner, line[1:-1], strict=True)]
-    knees = [ramp] if cruise <= 1e-9 * total else [ramp, ramp + cruise]
-    events += [(t, line[0] + profile(t)[0] * whole) for t in knees]
+    events.append((ramp, line[0] + climb * whole))
+    if cruise > 1e-9 * total:
+        events.append((ramp + cruise, line[0] + (1.0 - climb) * whole))
     events.sort(key=lambda event: event[0])
+    knots, rates = (0.0, ramp, ramp + cruise, total), (0.0, top, top, 0.0)
     previous = 0.0
     for t, q in events:
         # A knee that falls on a waypoint is one point, not two.
         if t - previous > 1e-9 * total and total - t > 1e-9 * total:
-            yield t, q, profile(t)[1] * whole
+            yield t, q, np.interp(t, knots, rates) * whole
             previous = t
     yield total, line[-1], 0.0 * whole
 
@@ -273,21 +265,14 @@ def write_trajectory(
 
     Accelerations and efforts stay empty, which the message allows: given accelerations,
     controllers fit quintics, which a trapezoidal profile is not. Joint motions need no
-    `frame_id`. The robot brings `joint_names`, in the order of the columns.
+    `frame_id`. The robot brings `joint_names`, in the order of the columns, or is these names.
 
     Raises:
         PlanningError: joints and columns differ in number, or two points fall on the
             same nanosecond.
         MissingDependencyError: rosbags is not installed.
     """
-    write_message(path_file, robot.joint_names, trajectory, frame_id)
-
-
-def write_message(
-    path_file: str | Path, joint_names: Iterable[str], trajectory: Trajectory, frame_id: str = ""
-) -> None:
-    """`write_trajectory` for joints of these names."""
-    names = [str(name) for name in joint_names]
+    names = [str(name) for name in getattr(robot, "joint_names", robot)]
     if trajectory.positions.shape[1:] != (len(names),):
         given = f"{trajectory.positions.shape[1:]} joints"
         raise PlanningError(f"the trajectory has {given}, the robot {', '.join(names)}")

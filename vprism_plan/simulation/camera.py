@@ -14,16 +14,14 @@ _PALETTE = np.frombuffer(  # label 0: table and clutter
 ).reshape(-1, 3)
 
 
-def _default_intrinsics() -> np.ndarray:
-    return np.array([[608.0, 0.0, 319.5], [0.0, 608.0, 239.5], [0.0, 0.0, 1.0]])
-
-
 @dataclass(frozen=True, eq=False)
 class Camera:
     """A posed pinhole camera; pixel (column u, row v) is centred on integer coordinates."""
 
     T_world_camera: Float[np.ndarray, "4 4"]
-    intrinsics: Float[np.ndarray, "3 3"] = field(default_factory=_default_intrinsics)
+    intrinsics: Float[np.ndarray, "3 3"] = field(
+        default_factory=lambda: np.array([[608.0, 0, 319.5], [0, 608.0, 239.5], [0, 0, 1.0]])
+    )
     width: int = 640
     height: int = 480
 

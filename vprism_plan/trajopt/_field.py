@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """Values on a grid as a function with a continuous gradient."""
 
-import operator
 import weakref
 from collections.abc import Sequence
 from functools import cached_property
@@ -147,14 +146,11 @@ def union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> Spli
     Depth is the distance to what is outside of both: where an object stands on a table, the
     pull of its underside and the push of the table would cancel.
     """
-    field = fields[0]
-    key = np.asarray(planes, dtype=np.float64).tobytes()
-    for others, made in _unions.setdefault(field, {}).get(key, []):
-        if len(others) == len(fields) - 1 and all(map(operator.is_, others, fields[1:])):
-            return made
-    made = _union_field(fields, planes)
-    _unions[field].setdefault(key, []).append((tuple(fields[1:]), made))
-    return made
+    made = _unions.setdefault(fields[0], {})
+    key = np.asarray(planes, dtype=np.float64).tobytes(), *fields[1:]
+    if key not in made:
+        made[key] = _union_field(fields, planes)
+    return made[key]
 
 
 def _union_field(fields: Sequence[Any], planes: Float[np.ndarray, "p 4"]) -> SplineField:

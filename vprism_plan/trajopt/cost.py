@@ -271,8 +271,8 @@ class PathKernels:
     """
 
     def __init__(self, robot: Any, rules: Int[np.ndarray, " l"] | None = None) -> None:
-        packed = pack_robot(robot.arrays, rules=rules)
-        self.floats, self.ints, self._robot = packed.floats, packed.ints, robot
+        self.floats, self.ints = pack_robot(robot.arrays, rules=rules)
+        self._robot = robot
         self._turns = turning_joints(robot)
 
     def costs(

@@ -13,7 +13,9 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import choice, number, whole
+from vprism_plan._files import jsonable
 from vprism_plan.collision import CollisionChecker
+from vprism_plan.collision.reports import Answer
 from vprism_plan.errors import PlanningError
 from vprism_plan.planning import CheckerLike
 from vprism_plan.planning.attempts import within_risk
@@ -47,7 +49,7 @@ OptimizeStatus = Literal[
 
 
 @dataclass(frozen=True, eq=False)
-class History:
+class History(Answer):
     """Costs over the optimisation, one row per batch of evaluations.
 
     A row holds, for every seed, the values at the best point it had found by then in the
@@ -63,14 +65,9 @@ class History:
     terms: dict[str, np.ndarray]
     round: Int[np.ndarray, " i"]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        terms = {name: values.tolist() for name, values in self.terms.items()}
-        return {"cost": self.cost.tolist(), "terms": terms, "round": self.round.tolist()}
-
 
 @dataclass(frozen=True)
-class SeedReport:
+class SeedReport(Answer):
     """What became of one seed.
 
     Attributes:
@@ -91,13 +88,9 @@ class SeedReport:
     stopped: str
     refused: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        return dict(self.__dict__)
-
 
 @dataclass(frozen=True)
-class OptimizeReport:
+class OptimizeReport(Answer):
     """The numbers behind an `OptimizeResult`.
 
     Attributes:
@@ -151,15 +144,11 @@ class OptimizeReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values."""
-        values = dict(self.__dict__)
-        values["seeds"] = [seed.to_dict() for seed in self.seeds]
-        values["risk"] = self.risk.to_dict() if hasattr(self.risk, "to_dict") else None
-        values["winner_name"] = self.winner_name
-        return values
+        return {**super().to_dict(), "winner_name": self.winner_name}
 
 
 @dataclass(frozen=True, eq=False)
-class OptimizeResult:
+class OptimizeResult(Answer):
     """The verdict on an optimisation.
 
     Attributes:
@@ -198,13 +187,8 @@ class OptimizeResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-ready values, the trajectories of all seeds left out."""
-        return {
-            "path": None if self.path is None else self.path.tolist(),
-            "status": self.status,
-            "message": self.message,
-            "report": self.report.to_dict(),
-            "history": None if self.history is None else self.history.to_dict(),
-        }
+        kept = "path", "status", "message", "report", "history"
+        return {name: jsonable(getattr(self, name)) for name in kept}
 
 
 def default_cost(checker: Any, kept: float | None = None) -> TrajectoryCost:

@@ -12,6 +12,7 @@ from torch import Tensor
 from vprism_plan._arguments import choice, number
 from vprism_plan._kernels import trajopt as kernels
 from vprism_plan.collision import CollisionChecker
+from vprism_plan.collision.config import contact_rules
 from vprism_plan.errors import ConfigError
 from vprism_plan.robots.pairs import pair_room
 from vprism_plan.trajopt._field import grown, union_field
@@ -135,15 +136,11 @@ class SceneCost(SphereCost):
                 f"got a {type(world).__name__}; pass a VPrismMap, a World or a CollisionChecker"
             )
         arrays = robot.arrays
-        allowed = [frozenset[int]()] * len(arrays.link_frame)
-        if checker is not None:
-            allowed = [checker.allowed_objects(link) for link in range(len(allowed))]
-        sets = tuple(dict.fromkeys(allowed))
-        index = np.array([sets.index(own) for own in allowed], dtype=np.int64)
+        sets, index = contact_rules(robot, checker.config.allowed_contacts if checker else {})
         super().__init__(robot, index, **options)
         self._checker, self._map = checker, map_
         self._world: Any = None if map_ is world else world
-        self._allowed, self._link_rules = sets, index
+        self._allowed = sets
         self._room = 0.0 if checker is None else float(checker.config.margin)
         self._checked = (~arrays.link_fixed[arrays.sphere_link]).nonzero()[0]
         self._rules = index[arrays.sphere_link][self._checked]
@@ -218,17 +215,11 @@ class ClearanceCost(SceneCost):
             backend=backend, weight=weight, name=name,
         )  # fmt: skip
         self.margin = number("margin", margin, 0.0, unit="metres", above=True)
-        self._field = union_field(self._verdict_fields(), self._planes)
+        fields = [self._world.field] if self._checker is None else self._checker.fields
+        self._field = union_field(fields, self._planes)
         self._packed = self._field.packed(self.margin, self._room, self._planes)
         radii = self.robot.arrays.sphere_radius + self._room
         self._both = radii, grown(radii, self._field.spacing)
-
-    def _verdict_fields(self) -> list[Any]:
-        """The distance field of each rule by which verdicts are given."""
-        if self._checker is None:
-            return [self._world.field]
-        first = [self._link_rules.tolist().index(rule) for rule in range(len(self._allowed))]
-        return [self._checker.verdict_field(link) for link in first]
 
     def _kernel(self, grad: np.ndarray, *samples: np.ndarray) -> float:
         assert self._compiled is not None

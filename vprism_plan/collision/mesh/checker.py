@@ -458,10 +458,10 @@ class MeshChecker(explain.Checker):
 
     def _plane_contacts(self) -> Iterator[Contact]:
         for plane, name in zip(self._planes, self.world.plane_names, strict=True):
-            gaps = self.placed.plane_gaps(plane)
+            gaps, lowest = self.placed.plane_gaps(plane), self.placed.lowest_points(plane[:3])
             for i in np.flatnonzero(self.placed.moving & (gaps <= self._need)).tolist():
-                point = self.placed.lowest_point(i, plane[:3])
-                yield self._contact(i, name, (float(gaps[i]), point, plane[:3]), self._need[i])
+                touch = float(gaps[i]), lowest[i], plane[:3]
+                yield self._contact(i, name, touch, self._need[i])
 
     def _body_contacts(
         self, near: Bool[np.ndarray, "n b"], need: Values, detail: str = ""

@@ -11,7 +11,7 @@ import numpy as np
 from vprism_plan.collision.mesh import fcl
 from vprism_plan.collision.mesh.seen import SEEN
 from vprism_plan.collision.packing import Configuration, Numbers, configurations
-from vprism_plan.collision.reports import Contact
+from vprism_plan.collision.reports import Answer, Contact
 from vprism_plan.world.grid import Vector
 from vprism_plan.world.sources import SOURCES, object_id, source_of
 
@@ -44,7 +44,7 @@ CAUSES: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class Cause:
+class Cause(Answer):
     """Why one contact is refused by one checker and not by the other."""
 
     kind: str  # the cause
@@ -108,7 +108,7 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class PathFinding:
+class PathFinding(Answer):
     """A collision on an edge of a path."""
 
     edge: int  # number of the edge; edge 0 leads from waypoint 0 to waypoint 1
@@ -124,18 +124,9 @@ class PathFinding:
         why = f" (why: {why})" if why else ""
         return f"edge {self.edge} at {self.fraction:.3f}: {reasons}{why}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready values."""
-        return {
-            **vars(self),
-            "configuration": list(self.configuration),
-            "contacts": [contact.to_dict() for contact in self.contacts],
-            "causes": [dict(vars(cause)) for cause in self.causes],
-        }
-
 
 @dataclass(frozen=True)
-class PathOpinion:
+class PathOpinion(Answer):
     """Whether a path is free of surfaces, at discrete configurations.
 
     Attributes:
@@ -158,10 +149,6 @@ class PathOpinion:
         if self.valid:
             return f"{self.judge} agrees ({how})"
         return f"{self.judge} disagrees ({how}): " + "; ".join(f.text() for f in self.findings)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-ready keys."""
-        return {**vars(self), "findings": [found.to_dict() for found in self.findings]}
 
 
 def compare(checker: Any, mesh_checker: Any, Q: Numbers) -> Comparison:

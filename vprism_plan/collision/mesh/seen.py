@@ -14,6 +14,7 @@ from vprism_plan.collision.mesh.solids import PlacedSolids
 from vprism_plan.robots.surfaces import drawn_points
 from vprism_plan.world import visibility
 from vprism_plan.world.grid import Chosen, Points, Values
+from vprism_plan.world.marks import Evidence
 from vprism_plan.world.seen import lost_cones, lost_points, surface_points
 from vprism_plan.world.unseen_objects import open_sides
 
@@ -132,12 +133,8 @@ class HiddenSpace:
         map_, config = world.map, world.config
         self._map, self._config, self._placed = map_, config, placed
         self._plane = map_.plane
-        self._bounded = config.support == "seen" and map_.plane is not None
-        tolerance = config.occlusion_tolerance
-        self._views = [visibility.make_view(v, tolerance, map_.plane) for v in map_.views]
-        self._below = []
-        if self._bounded:
-            self._below = [visibility.make_view(v, tolerance) for v in map_.views]
+        evidence = Evidence(map_, config)
+        self._views, self._below = evidence.views, evidence.below
         # As much room around the robot as the world's cells leave it.
         self._balls = np.concatenate([np.empty((0, 4)), *(view.robot for view in self._views)])
         self._clutter: list[visibility.View] = []
@@ -170,7 +167,7 @@ class HiddenSpace:
         if self._plane is not None:
             under = self._plane.signed_distance(points) < 0.0
         status = visibility.classify_points(self._views, points)
-        if self._bounded and under.any():
+        if self._below is not None and under.any():
             status[under] = visibility.classify_points(self._below, points[under])
         hidden, unknown = status == visibility.OCCLUDED, status == visibility.UNOBSERVED
         if config.occluded == "free":
@@ -188,7 +185,7 @@ class HiddenSpace:
             unknown |= ((points < lower) | (points > upper)).any(axis=1)
         codes = np.where(unknown, visibility.UNOBSERVED, 0)
         codes[hidden] = visibility.OCCLUDED
-        if not self._bounded:
+        if self._below is None:
             codes[under] = 0  # the half-space answers there
         return codes
 

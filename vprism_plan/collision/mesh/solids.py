@@ -248,28 +248,20 @@ class PlacedSolids:
 
     def plane_gaps(self, plane: Float[np.ndarray, "4"]) -> Values:
         """Signed distance from each solid to the half-space {x : n . x < offset}, exact, metres."""
-        normal = plane[:3]
-        local = np.abs(np.einsum("nij,i->nj", self.R, normal))  # in each solid's frame
-        reach = np.einsum("ni,ni->n", local, self._halves)
-        reach += self._rims * np.hypot(local[:, 0], local[:, 1]) + self._balls
-        gaps = self.t @ normal - plane[3] - reach
-        for i in self._meshes:
-            gaps[i] = self.lowest_point(int(i), normal) @ normal - plane[3]
-        return gaps
+        return self.lowest_points(plane[:3]) @ plane[:3] - plane[3]
 
-    def lowest_point(self, i: int, normal: Vector) -> Vector:
-        """World point of a solid that lies farthest against a direction."""
-        solid = self.solids[i]
-        if solid.vertices is not None:
-            T = self._link_poses[self._row[i]]
-            lowest = np.argmin(solid.vertices @ (T[:3, :3].T @ normal))
-            return T[:3, :3] @ solid.vertices[lowest] + T[:3, 3]
-        local = self.R[i].T @ normal
-        point = -self._balls[i] * local - np.sign(local) * self._halves[i]
-        across = np.hypot(local[0], local[1])
-        if across > 0.0:
-            point[:2] -= self._rims[i] * local[:2] / across
-        return self.R[i] @ point + self.t[i]
+    def lowest_points(self, normal: Vector) -> Float[np.ndarray, "n 3"]:
+        """World point of each solid that lies farthest against a direction."""
+        local = np.einsum("nij,i->nj", self.R, normal)  # in each solid's frame
+        points = -self._balls[:, None] * local - np.sign(local) * self._halves
+        across = np.maximum(np.hypot(local[:, 0], local[:, 1]), 1e-300)
+        points[:, :2] -= (self._rims / across)[:, None] * local[:, :2]
+        lowest = np.einsum("nij,nj->ni", self.R, points) + self.t
+        for i in self._meshes:
+            T, vertices = self._link_poses[self._row[i]], np.asarray(self.solids[i].vertices)
+            farthest = vertices[np.argmin(vertices @ (T[:3, :3].T @ normal))]
+            lowest[i] = T[:3, :3] @ farthest + T[:3, 3]
+        return lowest
 
     def pairs(self) -> Int[np.ndarray, "p 2"]:
         """Pairs of solids of the link pairs that the robot tests against each other."""
