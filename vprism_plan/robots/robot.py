@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import rigid_pose
-from vprism_plan._read_only import make_read_only
+from vprism_plan._read_only import ReadOnly
 from vprism_plan._shapes import Pairs, Pose
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import changes, kinematics, pairs, surfaces
@@ -44,7 +44,7 @@ class _Parts:
 
 
 @dataclass(frozen=True, eq=False)
-class Robot:
+class Robot(ReadOnly):
     """A robot read from a URDF; build it with :meth:`from_urdf`.
 
     A configuration ``q`` has one value per name in ``joint_names``: radians for revolute and
@@ -111,13 +111,6 @@ class Robot:
     _changes: tuple[tuple[str, dict[str, Any]], ...] = field(default=(), repr=False)
     attached: dict[str, str] = field(default_factory=dict)
     held: dict[str, Held] = field(default_factory=dict, repr=False)
-
-    def __post_init__(self) -> None:
-        make_read_only(self.__dict__)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        make_read_only(state)
 
     @classmethod
     def from_urdf(
