@@ -169,15 +169,11 @@ def surface_samples(triangles: Triangles, count: int = _SAMPLES, seed: int = 0) 
 
 def drawn_points(triangles: Triangles, count: int, seed: int = 0) -> tuple[Points, Points]:
     """Points of a surface, uniform by area, and the unit normals of their triangles."""
-    rng = np.random.default_rng(seed)
-    edges = triangles[:, 1:] - triangles[:, :1]
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    area = np.linalg.norm(normal, axis=1)
-    which = rng.choice(len(triangles), size=count, p=area / area.sum())
-    share = rng.random((count, 2))
-    share = np.where(share.sum(axis=1, keepdims=True) > 1.0, 1.0 - share, share)
-    points = triangles[which, 0] + np.einsum("nk,nkj->nj", share, edges[which])
-    return points, normal[which] / area[which, None]
+    import trimesh
+
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=False)
+    points, which = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    return np.asarray(points), np.asarray(mesh.face_normals[which])
 
 
 # ------------------------------------------------------------------------ balls inside solids
