@@ -132,17 +132,15 @@ def find_mesh(
         places, guesses = _in_packages(rest, folder, package_dirs)
     elif scheme in ("", "file"):
         places = [folder / rest]  # an absolute path replaces the folder
-    found = next((place for place in places if place.is_file()), None)
-    if found is None:
-        found = next((place for place in guesses if place.is_file()), None)
-        places = places + guesses
-        if found is not None:
-            _logger.warning(
-                "no package of the name was found for '%s'; '%s' is taken, whose folder is called "
-                "otherwise: if that is another package's file, pass package_dirs=",
-                *(filename, found),
-            )
-    return found, [str(place) for place in places] or [filename]
+    every = [*places, *guesses]
+    found = next((place for place in every if place.is_file()), None)
+    if found is not None and found not in places:
+        _logger.warning(
+            "no package of the name was found for '%s'; '%s' is taken, whose folder is called "
+            "otherwise: if that is another package's file, pass package_dirs=",
+            *(filename, found),
+        )
+    return found, [str(place) for place in every] or [filename]
 
 
 def _in_packages(

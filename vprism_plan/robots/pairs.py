@@ -210,16 +210,6 @@ def touching_pairs(
     return {(names[a], names[b]) for a, b in arrays.pairs[touching]}
 
 
-def touching_shares(
-    arrays: KinematicArrays, names: Sequence[str], samples: int, seed: int
-) -> dict[frozenset[str], float]:
-    """See :meth:`Robot.touching_shares`."""
-    q = random_configurations(arrays, samples, np.random.default_rng(seed))
-    shares = pairs_touching(arrays, q, arrays.pairs).mean(axis=0)
-    pairs = [frozenset((names[a], names[b])) for a, b in arrays.pairs]
-    return dict(zip(pairs, shares.tolist(), strict=True))
-
-
 def random_configurations(arrays: KinematicArrays, n: int, rng: Generator) -> Configurations:
     """Uniform configurations within the limits."""
     return rng.uniform(arrays.lower, arrays.upper, size=(n, len(arrays.lower)))

@@ -535,7 +535,10 @@ class Robot(ReadOnly):
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
         """
-        return pairs.touching_shares(self.arrays, self.link_names, samples, seed)
+        q = pairs.random_configurations(self.arrays, samples, np.random.default_rng(seed))
+        shares = pairs.pairs_touching(self.arrays, q, self.collision_pairs).mean(axis=0)
+        names = [frozenset(self.link_names[i] for i in pair) for pair in self.collision_pairs]
+        return dict(zip(names, shares.tolist(), strict=True))
 
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML, to be read bit by bit as ``<stem>_spheres.yml``.
