@@ -27,11 +27,6 @@ def backproject(depth: Image, intrinsics: Matrix) -> PointImage:
     return rays * np.where(depth > 0, depth, np.nan)[..., None].astype(np.float64)
 
 
-def point_image(depth: Image, intrinsics: Matrix, T_world_camera: Pose) -> PointImage:
-    """Return the world point (metres) behind every pixel, NaN where there is no return."""
-    return transform_points(T_world_camera, backproject(depth, intrinsics))
-
-
 def lift(depth: Image, intrinsics: Matrix, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Return the camera-frame points (metres) of some pixels, 0 where there is no return."""
     z = depth[row, column].astype(np.float64)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from vprism_plan._read_only import ReadOnly
 from vprism_plan._shapes import Configurations, Indices, Points, Pose, Spheres, Values, Vector
@@ -79,16 +80,6 @@ class Attachment:
     parent: str = ""
 
 
-def rotation(
-    axis: Vector, angle: Float[np.ndarray, "*batch"] | np.float64
-) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
-    return np.eye(3) + s * K + (1.0 - c) * (K @ K)
-
-
 def build_arrays(
     model: RobotModel,
     active: Sequence[str],
@@ -118,11 +109,11 @@ def build_arrays(
             frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
             links[joint.child] = Attachment(len(frames) - 1, np.eye(4), joint.parent)
         else:
-            value, motion = np.float64(factor * locked[driver] + shift), np.eye(4)
+            value, motion = factor * locked[driver] + shift, np.eye(4)
             if joint.kind == "prismatic":
                 motion[:3, 3] = value * joint.axis
             else:
-                motion[:3, :3] = rotation(joint.axis, value)
+                motion[:3, :3] = Rotation.from_rotvec(value * joint.axis).as_matrix()
             links[joint.child] = Attachment(parent.frame, T @ motion, joint.parent)
     chosen = [model.joint_map[name] for name in active]
     centers, radii, ball_centers, ball_radii = zip(
@@ -202,7 +193,8 @@ def frame_poses(
         if arrays.kind[f] == KIND_PRISMATIC:
             t[:, f] += value[:, None] * (R[:, f] @ arrays.axis[f])
         else:
-            R[:, f] = R[:, f] @ rotation(arrays.axis[f], value)
+            turn = Rotation.from_rotvec(value[:, None] * arrays.axis[f])
+            R[:, f] = R[:, f] @ turn.as_matrix()
     return R, t
 
 
