@@ -98,23 +98,21 @@ def build_arrays(
     links = {model.root: Attachment(0, np.eye(4))}
     for joint in model.joints:
         parent = links[joint.parent]
-        T = parent.T @ joint.T_origin
-        if not joint.moves:
-            links[joint.child] = Attachment(parent.frame, T, joint.parent)
-            continue
+        frame, T = parent.frame, parent.T @ joint.T_origin
         driver, factor, shift = model.resolve_mimic(joint.name)
-        if driver in active:
+        if joint.moves and driver in active:
             kind = KIND_PRISMATIC if joint.kind == "prismatic" else KIND_REVOLUTE
             index = list(active).index(driver)
-            frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
-            links[joint.child] = Attachment(len(frames) - 1, np.eye(4), joint.parent)
-        else:
-            value, motion = factor * locked[driver] + shift, np.eye(4)
+            frames.append((frame, T, joint.axis, kind, index, factor, shift))
+            frame, T = len(frames) - 1, np.eye(4)
+        elif joint.moves:
+            motion, way = np.eye(4), (factor * locked[driver] + shift) * joint.axis
             if joint.kind == "prismatic":
-                motion[:3, 3] = value * joint.axis
+                motion[:3, 3] = way
             else:
-                motion[:3, :3] = Rotation.from_rotvec(value * joint.axis).as_matrix()
-            links[joint.child] = Attachment(parent.frame, T @ motion, joint.parent)
+                motion[:3, :3] = Rotation.from_rotvec(way).as_matrix()
+            T = T @ motion
+        links[joint.child] = Attachment(frame, T, joint.parent)
     chosen = [model.joint_map[name] for name in active]
     centers, radii, ball_centers, ball_radii = zip(
         *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
