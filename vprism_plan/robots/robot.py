@@ -221,7 +221,7 @@ class Robot(ReadOnly):
             link_names=tuple(chosen.rows),
             geometry=solids,
             named_states=states,
-            groups=semantics.group_links,
+            groups=semantics.groups,
             disabled_pairs=disabled,
             arrays=arrays,
             links=links,
