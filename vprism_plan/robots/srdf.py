@@ -86,7 +86,6 @@ def _has(what: str, name: str, valid: Collection[str], missing: Missing) -> bool
 
 def _groups(root: ET.Element, model: RobotModel, missing: Missing, path: Path) -> Names:
     """The links of every group: as in MoveIt, what its joints move directly."""
-    parent_of = {joint.child: joint.parent for joint in model.joints}
     elements = {element.get("name", ""): element for element in root.findall("group")}
     tables: dict[str, Any] = {"joint": model.joint_map, "link": model.links, "group": elements}
     groups: Names = {}
@@ -94,14 +93,10 @@ def _groups(root: ET.Element, model: RobotModel, missing: Missing, path: Path) -
     def chain(group: str, base: str, tip: str) -> list[str]:
         if not all(_has("link", end, model.links, missing) for end in (base, tip)):
             return []
-        links: list[str] = []
-        link = tip
-        while link != base:
-            if link not in parent_of:
-                raise RobotError(f"group '{group}' in '{path}': '{base}' is not above '{tip}'")
-            links.insert(0, link)
-            link = parent_of[link]
-        return links
+        above = model.above(tip)
+        if base not in above:
+            raise RobotError(f"group '{group}' in '{path}': '{base}' is not above '{tip}'")
+        return above[: above.index(base)][::-1]
 
     def read(group: str, above: tuple[str, ...] = ()) -> tuple[str, ...]:
         if group in above:
@@ -154,10 +149,10 @@ def choose_joints(
 ) -> tuple[str, ...]:
     """The joints of a configuration: given, of the group, of the group "arm", or else all."""
     valid = model.movable
-    joint_of = {joint.child: joint.name for joint in model.joints if joint.name in valid}
 
     def of(name: str) -> list[str]:
-        return [joint_of[link] for link in semantics.groups.get(name, ()) if link in joint_of]
+        joints = (model.joint_above.get(link) for link in semantics.groups.get(name, ()))
+        return [joint.name for joint in joints if joint is not None and joint.name in valid]
 
     if group is not None:
         if joints is not None:

@@ -69,6 +69,18 @@ class RobotModel:
         """The joints by name."""
         return {joint.name: joint for joint in self.joints}
 
+    @functools.cached_property
+    def joint_above(self) -> dict[str, Joint]:
+        """The joint that each link but the root hangs on."""
+        return {joint.child: joint for joint in self.joints}
+
+    def above(self, link: str) -> list[str]:
+        """The links from one up to the root, itself first."""
+        links = [link]
+        while links[-1] in self.joint_above:
+            links.append(self.joint_above[links[-1]].parent)
+        return links
+
     @property
     def actuated(self) -> tuple[str, ...]:
         """Names of the joints that move and do not mimic another."""
