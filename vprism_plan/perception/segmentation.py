@@ -137,11 +137,11 @@ def _accept(
     min_area: float,
 ) -> Clusters:
     """Keep the clusters that can be objects on the table; number them by visible area."""
-    accepted: list[tuple[float, int]] = []
     pixels, areas = np.bincount(clusters.ravel()), _areas(clusters, image)
     large = (pixels >= min_points) & (areas >= min_area)
     large[0] = False
-    for cluster in np.flatnonzero(large).tolist():
+    number, order = np.zeros(len(pixels), dtype=np.int32), np.argsort(-areas, kind="stable")
+    for cluster in order[large[order]].tolist():
         member = clusters == cluster
         if np.percentile(image.height[member], 99.0) > max_height:
             continue
@@ -150,10 +150,7 @@ def _accept(
         if size.max() > max_size:
             continue
         if region.contains(points[member], 0.02).mean() >= _MIN_ON_TABLE:
-            accepted.append((-float(areas[cluster]), cluster))
-    number = np.zeros(len(pixels), dtype=np.int32)
-    for label, (_, cluster) in enumerate(sorted(accepted), start=1):
-        number[cluster] = label
+            number[cluster] = number.max() + 1
     return number[clusters]
 
 
@@ -279,8 +276,7 @@ def _split_at_valleys(
     order = np.argsort(piece, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
     found = 0
-    # Largest first; the parts of one that falls apart come at once, the last one first.
-    stack = [(nodes, start, end) for nodes in sorted(groups, key=len, reverse=True)][::-1]
+    stack = [(nodes, start, end) for nodes in groups]
     while stack:
         members, first, second = stack.pop()
         parts: list[np.ndarray] = []
