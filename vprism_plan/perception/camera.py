@@ -7,6 +7,7 @@ metres; pixel (u, v) = (column, row), and a whole number is the *centre* of a pi
 
 import numpy as np
 from jaxtyping import Float, Num
+from scipy.spatial import cKDTree
 
 from vprism_plan._shapes import Chosen, Image, Matrix, PointImage, Points, Pose, Values, Vector
 
@@ -68,8 +69,6 @@ def within_balls(points: Points, balls: Float[np.ndarray, "s 4"]) -> Chosen:
     dimensions, with the root of R^2 - r^2 as the fourth, answers that for all balls with radii
     up to R at once; down to half of R, so that the fourth does not outweigh the others.
     """
-    from scipy.spatial import cKDTree
-
     inside = np.zeros(len(points), dtype=bool)
     left = np.flatnonzero(np.isfinite(points).all(axis=1))
     balls = balls[balls[:, 3] >= 0.0]

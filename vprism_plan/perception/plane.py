@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import ConvexHull
 
 from vprism_plan._read_only import ReadOnly
 from vprism_plan._shapes import Chosen, Points, Pose, Values, Vector
@@ -110,8 +112,6 @@ def over_extent(plane: Plane, on_plane: Points, others: Points, grown: bool = Tr
     That is a grid of 4 cm cells that hold a point of the plane. `grown`, it is closed over gaps
     of 12 cm and one cell wider: the foot and the shadow of an object are not visible.
     """
-    from scipy import ndimage
-
     if not len(on_plane):
         return np.zeros(len(others), dtype=bool)
     axes = plane.axes()
@@ -152,9 +152,6 @@ def table_region(plane: Plane, on_plane: Points) -> TableRegion:
     Raises:
         PlaneNotFoundError: the points cover no patch of 6 cm x 6 cm.
     """
-    from scipy import ndimage
-    from scipy.spatial import ConvexHull
-
     axes = plane.axes()
     flat = on_plane @ axes.T
     centre = np.median(flat, axis=0)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial import cKDTree
 
 from vprism_plan._arguments import number
 from vprism_plan._shapes import Chosen, Indices, Points, Values, Vector
@@ -227,8 +228,6 @@ def _find_plane(points: Points, band: Values, rng: Generator, up: Vector | None)
 
 def _hypotheses(points: Points, rng: Generator) -> tuple[Points, Values]:
     """Normals and offsets of planes through triples of points, degenerate triples dropped."""
-    from scipy.spatial import cKDTree
-
     n_local = 2 * _HYPOTHESES // 3
     neighbours = min(_NEIGHBOURS, len(points))
     anchors = rng.integers(len(points), size=n_local)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._shapes import Indices, Pixels, PointImage, Points, Values
@@ -187,8 +188,6 @@ def _areas(clusters: Clusters, image: SurfaceImage) -> Float[np.ndarray, " c"]:
 
 def _attach(clusters: Clusters, raised: Pixels, points: PointImage) -> None:
     """Give raised pixels without a cluster to the nearest one in space, if it is near."""
-    from scipy.spatial import cKDTree
-
     owned = clusters > 0
     loose = raised & ~owned
     if owned.any() and loose.any():
@@ -229,8 +228,6 @@ def _join_fragments(
 
 def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
     """Whether a tenth of the small cluster lies within reach of the big one."""
-    from scipy.spatial import cKDTree
-
     lower, upper = small.min(axis=0) - reach, small.max(axis=0) + reach
     near = big[((big >= lower) & (big <= upper)).all(axis=1)]
     if not len(near):
@@ -241,8 +238,6 @@ def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
 
 def _footprint(flat: np.ndarray) -> np.ndarray | None:
     """Half-planes of the convex hull of a footprint, or None if it has no area."""
-    from scipy.spatial import ConvexHull, QhullError
-
     try:
         return np.asarray(ConvexHull(flat).equations)
     except (QhullError, ValueError):

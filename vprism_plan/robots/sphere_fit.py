@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.distance import cdist
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._files import cache_folder, replacing
@@ -234,8 +235,6 @@ def _settled(surface: Surface, centres: Points) -> tuple[Spheres, float]:
 
 def _moved(surface: Surface, centre: Vector, own: Indices) -> Vector:
     """Where a sphere that holds these triangles stands out least, by a pattern search."""
-    from scipy.spatial.distance import cdist
-
     points = surface.points[np.unique(surface.faces[own])]
 
     def cost(x: np.ndarray) -> np.ndarray:
