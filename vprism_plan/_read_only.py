@@ -6,15 +6,20 @@ from typing import Any
 import numpy as np
 
 
-def make_read_only(values: dict[str, Any]) -> None:
-    """Make every array among the values, or one table deep in them, refuse in-place changes.
+class ReadOnly:
+    """Makes every array among a dataclass's values, or one table deep in them, refuse changes.
 
-    Pickling and deepcopy forget it: call this from `__setstate__`, too. What goes to kernels
-    must stay writeable: to numba, a read-only array is a type of its own, for which every
-    kernel is compiled again.
+    What goes to kernels must stay writeable: to numba, a read-only array is a type of its own,
+    for which every kernel is compiled again.
     """
-    for value in values.values():
-        inner = value.values() if isinstance(value, dict) else (value,)
-        for array in inner:
-            if isinstance(array, np.ndarray):
-                array.setflags(write=False)
+
+    def __post_init__(self) -> None:
+        for value in self.__dict__.values():
+            for array in value.values() if isinstance(value, dict) else (value,):
+                if isinstance(array, np.ndarray):
+                    array.setflags(write=False)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Pickling and deepcopy forget it."""
+        self.__dict__.update(state)
+        ReadOnly.__post_init__(self)

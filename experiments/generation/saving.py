@@ -24,12 +24,11 @@ from experiments.generation.raycasting import DEPTH_UNIT, metres
 from experiments.generation.scene import MeshObject, MeshScene
 from experiments.generation.shapes import from_millimetres, to_millimetres
 from experiments.generation.silhouettes import silhouettes
-from vprism_plan._files import read_json, reading, write_text
+from vprism_plan._files import read_json, reading, replacing, write_text
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception import load_observation
 from vprism_plan.perception.camera import invert_transform
 from vprism_plan.perception.observation import check_pose
-from vprism_plan.perception.readers import write_atomically
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scene_io import GROUND_TRUTH, view_from_dict, view_to_dict
 
@@ -211,7 +210,8 @@ def _write_model(body: MeshObject, path: Path) -> None:
 
     mesh = trimesh.Trimesh(to_millimetres(body.vertices), body.faces, process=False)
     content: Any = mesh.export(file_type="ply", vertex_normal=False)
-    write_atomically(path, lambda stream: stream.write(content))
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def _read_model(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -233,7 +233,8 @@ def _write_png(path: Path, image: np.ndarray) -> None:
     from PIL import Image
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda stream: Image.fromarray(image).save(stream, format="PNG"))
+    with replacing(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

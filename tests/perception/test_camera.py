@@ -11,7 +11,6 @@ from vprism_plan.perception.camera import (
     backproject,
     invert_transform,
     pixel_rays,
-    point_image,
     project,
     transform_points,
 )
@@ -45,7 +44,7 @@ def test_world_points_return_to_the_camera(seed):
     rng = np.random.default_rng(seed)
     K, pose = intrinsics(9, 7), rigid(rng)
     depth = rng.uniform(0.1, 5.0, (7, 9)).astype(np.float32)
-    world = point_image(depth, K, pose)
+    world = transform_points(pose, backproject(depth, K))
     assert world.dtype == np.float64
     back = transform_points(invert_transform(pose), world)
     np.testing.assert_allclose(back, backproject(depth, K), atol=1e-12)

@@ -151,8 +151,8 @@ def test_interrupted_npz_keeps_the_old_file(obs, tmp_path, monkeypatch):
     save_observation(obs, path)
     before = path.read_bytes()
 
-    def fail(stream, **kwargs):
-        stream.write(b"half")
+    def fail(path, **kwargs):
+        path.write_bytes(b"half")
         raise OSError("disk full")
 
     monkeypatch.setattr(np, "savez_compressed", fail)

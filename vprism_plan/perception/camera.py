@@ -7,6 +7,7 @@ metres; pixel (u, v) = (column, row), and a whole number is the *centre* of a pi
 
 import numpy as np
 from jaxtyping import Float, Num
+from scipy.spatial import cKDTree
 
 from vprism_plan._shapes import Chosen, Image, Matrix, PointImage, Points, Pose, Values, Vector
 
@@ -25,11 +26,6 @@ def backproject(depth: Image, intrinsics: Matrix) -> PointImage:
     """Turn a depth image into camera-frame points (metres), NaN where depth is 0 (no return)."""
     rays = pixel_rays((depth.shape[0], depth.shape[1]), intrinsics)
     return rays * np.where(depth > 0, depth, np.nan)[..., None].astype(np.float64)
-
-
-def point_image(depth: Image, intrinsics: Matrix, T_world_camera: Pose) -> PointImage:
-    """Return the world point (metres) behind every pixel, NaN where there is no return."""
-    return transform_points(T_world_camera, backproject(depth, intrinsics))
 
 
 def lift(depth: Image, intrinsics: Matrix, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -73,8 +69,6 @@ def within_balls(points: Points, balls: Float[np.ndarray, "s 4"]) -> Chosen:
     dimensions, with the root of R^2 - r^2 as the fourth, answers that for all balls with radii
     up to R at once; down to half of R, so that the fourth does not outweigh the others.
     """
-    from scipy.spatial import cKDTree
-
     inside = np.zeros(len(points), dtype=bool)
     left = np.flatnonzero(np.isfinite(points).all(axis=1))
     balls = balls[balls[:, 3] >= 0.0]

@@ -34,9 +34,7 @@ def _read_pcd(path: Path) -> Cloud:
     with path.open("rb") as stream:
         cloud = library.PointCloud.from_fileobj(stream)
     shape = (cloud.metadata.height, cloud.metadata.width)
-    points = np.stack([np.asarray(cloud.pc_data[axis], np.float64) for axis in "xyz"], axis=-1)
-    name = next((name for name in _LABELS if name in cloud.fields), None)
-    labels = None if name is None else _whole(cloud.pc_data[name], f"field {name!r}")
+    points, labels = _columns(cloud.pc_data)
     view = np.array(cloud.metadata.viewpoint[:3], dtype=np.float64)
     if shape[0] > 1:
         points = points.reshape(*shape, 3)
@@ -53,15 +51,19 @@ def _read_ply(path: Path) -> Cloud:
     vertex = raw.get("vertex", {}).get("data")
     if vertex is None or len(raw.get("face", {}).get("data", ())):
         raise ObservationError(f"{path} is a mesh or empty; a view is a cloud of seen points")
-    names = vertex.dtype.names or ()
-    points = np.stack([np.asarray(vertex[axis], np.float64).ravel() for axis in "xyz"], axis=-1)
-    name = next((name for name in _LABELS if name in names), None)
-    labels = None if name is None else _whole(vertex[name].ravel(), f"property {name!r}")
+    points, labels = _columns(vertex)
     seen = raw.get("camera", {}).get("data")
     view = None
     if seen is not None and len(seen) and "view_px" in (seen.dtype.names or ()):
         view = np.array([float(seen[f"view_p{axis}"][0]) for axis in "xyz"])
     return points, labels, view if view is not None and view.any() else None
+
+
+def _columns(table: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points (N, 3), and labels if there are some, of a table with named columns."""
+    points = np.stack([np.asarray(table[axis], np.float64).ravel() for axis in "xyz"], axis=-1)
+    name = next((name for name in _LABELS if name in (table.dtype.names or ())), None)
+    return points, None if name is None else _whole(table[name].ravel(), f"field {name!r}")
 
 
 def _read_npy(path: Path) -> Cloud:

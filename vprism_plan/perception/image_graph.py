@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from vprism_plan._shapes import Image, Indices, Matrix, Pixels
 from vprism_plan.perception.camera import stereo_noise
@@ -78,9 +81,6 @@ def graph_edges(image: SurfaceImage, mask: Pixels) -> tuple[Indices, Indices]:
 
 def components(count: int, start: Indices, end: Indices) -> Indices:
     """Number the connected components of a graph, from 0."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
     graph = coo_matrix((np.ones(len(start), dtype=bool), (start, end)), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
@@ -93,8 +93,6 @@ def flying_pixels(image: SurfaceImage) -> Pixels:
     ramp of more than three pixels may be the side of a box seen at a glancing angle and stays.
     A pixel with fewer than two of its eight neighbours on its own surface counts too.
     """
-    from scipy import ndimage
-
     shape = image.depth.shape
     near, ramp = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=bool)
     diagonal = np.eye(_MAX_RAMP + 1, dtype=bool)

@@ -26,15 +26,11 @@ UINT16_MAX = 65535
 
 def read_depth(path: Path) -> np.ndarray:
     """Return depth (H, W) as it is: raw sensor units, 0 also for "no data", or floats."""
-    return without_no_data(_read_depth(path))
-
-
-def _read_depth(path: Path) -> np.ndarray:
     if path.suffix == ".npy":
-        return read_array(path)
+        return without_no_data(read_array(path))
     remedy = "an 8-bit image has lost the metric depth: export the raw one"
     wanted = f"depth must be a 16-bit or float single-channel PNG or TIFF ({remedy})"
-    return _read(path, _DEPTH_MODES, wanted)[0]
+    return without_no_data(_read(path, _DEPTH_MODES, wanted)[0])
 
 
 def without_no_data(raw: np.ndarray) -> np.ndarray:
@@ -90,7 +86,7 @@ def _read(path: Path, modes: tuple[str, ...], wanted: str) -> tuple[np.ndarray, 
 
     Of more pages than one it is (N, H, W).
     """
-    from PIL import Image
+    from PIL import Image, ImageSequence
 
     if not path.is_file():
         raise ObservationError(f"{path} is missing")
@@ -102,16 +98,11 @@ def _read(path: Path, modes: tuple[str, ...], wanted: str) -> tuple[np.ndarray, 
         if image.width * image.height * pages > MOST_PIXELS:
             size = f"{image.width} x {image.height} pixels; at most {MOST_PIXELS:,} are read"
             raise ObservationError(f"{path} is an image of {size}")
-        pixels, mode = np.array(image), image.mode
-        if pages > 1:
-            stack = []
-            for page in range(pages):
-                image.seek(page)
-                stack.append(np.array(image))
-            pixels = np.stack(stack)
+        mode = image.mode
+        stack = np.stack([np.array(page) for page in ImageSequence.Iterator(image)])
     if mode not in modes:
         raise ObservationError(f"{path} has pixel format {mode}; {wanted}")
-    return pixels, mode
+    return stack if len(stack) > 1 else stack[0], mode
 
 
 def straight(given: dict[str, Any], camera: CameraFile) -> Observation:

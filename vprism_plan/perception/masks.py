@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from vprism_plan._shapes import Chosen, Ids, Image, Indices, Pixels, PointImage, Points
 from vprism_plan.perception.camera import depth_sigma, inlier_band, lift, pixel_rays
@@ -277,8 +278,6 @@ def _see_through(image: MaskView, own: Pixels, fringe: Pixels) -> tuple[Pixels, 
     Both are away from its foot. The second may be a fringe: within four pixels of the mask's
     edge and five of a raised part. Of the first there are enough for an object, or none.
     """
-    from scipy.spatial import cKDTree
-
     nothing = np.zeros_like(own)
     shows = own & image.on_plane
     if shows.sum() < _FEWEST:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int32
 from vprism_plan._arguments import number, rigid_pose
 from vprism_plan._shapes import Image, Pixels, PointImage, Points, Pose, Vector
 from vprism_plan.errors import ObservationError
-from vprism_plan.perception.camera import backproject, point_image, within_balls
+from vprism_plan.perception.camera import backproject, transform_points, within_balls
 from vprism_plan.perception.labels import label_image, to_numpy
 from vprism_plan.perception.plane import Plane
 
@@ -206,7 +206,7 @@ class Observation:
 
     def point_image(self) -> PointImage:
         """World point (metres) behind every pixel, NaN where there is no return."""
-        return point_image(self.depth, self.intrinsics, self.pose)
+        return transform_points(self.pose, backproject(self.depth, self.intrinsics))
 
     def points(self) -> tuple[Points, Int32[np.ndarray, " n"]]:
         """World points (metres) of the pixels with a return, row by row, and their labels.

@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import ConvexHull
 
-from vprism_plan._read_only import make_read_only
+from vprism_plan._read_only import ReadOnly
 from vprism_plan._shapes import Chosen, Points, Pose, Values, Vector
 from vprism_plan.errors import ObservationError, PlaneNotFoundError
 
@@ -17,7 +19,7 @@ _MAX_CELLS, _MIN_PATCH = 1000, 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Plane(ReadOnly):
     """The plane {x : normal . x = offset}; the normal points to the side of the camera.
 
     Attributes:
@@ -42,11 +44,7 @@ class Plane:
             raise ObservationError("plane normal is zero; it must point away from the surface")
         object.__setattr__(self, "normal", normal / length)
         object.__setattr__(self, "offset", offset / length)
-        make_read_only(self.__dict__)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        make_read_only(state)
+        super().__post_init__()
 
     def signed_distance(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
         """Height of points above the plane, metres; negative on the far side."""
@@ -114,8 +112,6 @@ def over_extent(plane: Plane, on_plane: Points, others: Points, grown: bool = Tr
     That is a grid of 4 cm cells that hold a point of the plane. `grown`, it is closed over gaps
     of 12 cm and one cell wider: the foot and the shadow of an object are not visible.
     """
-    from scipy import ndimage
-
     if not len(on_plane):
         return np.zeros(len(others), dtype=bool)
     axes = plane.axes()
@@ -156,9 +152,6 @@ def table_region(plane: Plane, on_plane: Points) -> TableRegion:
     Raises:
         PlaneNotFoundError: the points cover no patch of 6 cm x 6 cm.
     """
-    from scipy import ndimage
-    from scipy.spatial import ConvexHull
-
     axes = plane.axes()
     flat = on_plane @ axes.T
     centre = np.median(flat, axis=0)

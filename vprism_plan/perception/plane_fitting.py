@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial import cKDTree
 
 from vprism_plan._arguments import number
 from vprism_plan._shapes import Chosen, Indices, Points, Values, Vector
@@ -35,14 +36,10 @@ _HYPOTHESES, _SCORING_POINTS, _NEIGHBOURS, _REFINED = 768, 2000, 100, 8
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """A plane of the camera frame with what speaks for it among the points it was fitted to."""
+    """A plane of the camera frame, and those of the points it was fitted to that support it."""
 
     plane: Plane
     inliers: Chosen  # the points in their band around the plane
-    # Points in the two bands just under the plane, per inlier. Nothing is seen through a
-    # surface: near 0 for a real one, about 1 for a slice through something curved or noisy.
-    below: float
-    rms: float  # of the inliers' distance, metres
 
 
 def fit_plane(
@@ -109,8 +106,9 @@ def fit_plane(
     plane = refine(best.plane, background, band)
     if _concentration(plane, background, band) < _CLEAR:
         plane = refine(best.plane, background, _NARROW * band)
-    share = float(best.inliers.mean())
-    logger.info("support plane holds %.0f %% of the background, rms %.4f m", 100 * share, best.rms)
+    share, distance = 100 * best.inliers.mean(), best.plane.signed_distance(sample[best.inliers])
+    rms = float(np.sqrt(np.mean(distance**2)))
+    logger.info("support plane holds %.0f %% of the background, rms %.4f m", share, rms)
     return plane.transformed(obs.pose)
 
 
@@ -135,34 +133,34 @@ def _peel(
     points: Points, band: Values, among: Chosen, min_share: float, rng: Generator, up: Vector | None
 ) -> tuple[list[_Candidate], list[tuple[float, float]]]:
     """Peel the largest (level) planes off some of the points; return share, `below` of others."""
-    remaining = np.flatnonzero(among)
+    remaining = among.copy()
     found: list[_Candidate] = []
     rejected: list[tuple[float, float]] = []
     for _ in range(_MAX_PLANES):
-        if len(remaining) < max(3, min_share * len(points)):
+        if remaining.sum() < max(3, min_share * len(points)):
             break
-        candidate = _find_plane(points[remaining], band[remaining], rng, up)
-        if candidate is None:
+        plane = _find_plane(points[remaining], band[remaining], rng, up)
+        if plane is None:
             break
-        inliers = np.zeros(len(points), dtype=bool)
-        inliers[remaining[candidate.inliers]] = True
+        height = plane.signed_distance(points) / band
+        inliers = remaining & (np.abs(height) < 1.0)
         count = int(inliers.sum())
         share = count / len(points)
+        # Points in the two bands just under the plane, per inlier. Nothing is seen through a
+        # surface: near 0 for a real one, about 1 for a slice through something curved or noisy.
         # A ring around the walls of a bin, above the floor that was peeled off, is no surface:
         # other planes' points under its own cells count as well.
-        height = candidate.plane.signed_distance(points) / band
-        under = points[(height <= -1.0) & (height > -3.0)]
-        through = over_extent(candidate.plane, points[inliers], under, grown=False)
-        below = max(candidate.below, float(through.sum()) / max(1, count))
+        under = (height <= -1.0) & (height > -3.0)
+        through = over_extent(plane, points[inliers], points[under], grown=False)
+        below = float(max((under & remaining).sum(), through.sum())) / max(1, count)
         if share >= min_share and below <= _MAX_BELOW:
-            found.append(replace(candidate, inliers=inliers, below=below))
+            found.append(_Candidate(plane, inliers))
         else:
             rejected.append((share, below))
         if share < min_share:
             break
         # Twice the band: the fringe of a warped surface is not a plane of its own.
-        distance = np.abs(candidate.plane.signed_distance(points[remaining]))
-        remaining = remaining[distance > 2.0 * band[remaining]]
+        remaining &= np.abs(height) > 2.0
     return found, rejected
 
 
@@ -197,9 +195,7 @@ def _concentration(plane: Plane, points: Points, band: Values) -> float:
     return float((height < 0.5).sum()) / max(1, int((height < 1.0).sum()))
 
 
-def _find_plane(
-    points: Points, band: Values, rng: Generator, up: Vector | None
-) -> _Candidate | None:
+def _find_plane(points: Points, band: Values, rng: Generator, up: Vector | None) -> Plane | None:
     """Return the plane with most points in its band, or None if no triple spans one.
 
     Two thirds of the hypotheses take their three points from one neighbourhood: on a
@@ -219,26 +215,19 @@ def _find_plane(
         part = slice(start, start + 128)
         distance = np.abs(scored @ normals[part].T - offsets[part])
         counts[part] = (distance < scored_band[:, None]).sum(axis=0)
-    best: _Candidate | None = None
+    best, most = None, -1
     for index in np.argsort(-counts, kind="stable")[:_REFINED]:
         plane = refine(facing(normals[index], float(offsets[index])), points, band)
         if plane.normal @ up < least:
             continue
-        distance = plane.signed_distance(points)
-        height = distance / band
-        inliers = np.abs(height) < 1.0
-        count = int(inliers.sum())
-        if best is None or count > best.inliers.sum():
-            below = float(((height <= -1.0) & (height > -3.0)).sum()) / max(count, 1)
-            rms = float(np.sqrt(np.mean(distance[inliers] ** 2))) if count else 0.0
-            best = _Candidate(plane, inliers, below, rms)
+        count = int((np.abs(plane.signed_distance(points)) < band).sum())
+        if count > most:
+            best, most = plane, count
     return best
 
 
 def _hypotheses(points: Points, rng: Generator) -> tuple[Points, Values]:
     """Normals and offsets of planes through triples of points, degenerate triples dropped."""
-    from scipy.spatial import cKDTree
-
     n_local = 2 * _HYPOTHESES // 3
     neighbours = min(_NEIGHBOURS, len(points))
     anchors = rng.integers(len(points), size=n_local)

@@ -5,6 +5,9 @@ from typing import Any
 
 import numpy as np
 from scipy import ndimage
+from scipy.linalg import rq
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from vprism_plan._arguments import rigid_pose
 from vprism_plan._shapes import Indices, Matrix, Pixels, PointImage, Points, Vector
@@ -131,8 +134,6 @@ def _intrinsics(seen: Points, pixels: np.ndarray, turn: Matrix | None) -> Matrix
         fx, cx = np.polyfit(local[:, 0] / local[:, 2], pixels[:, 0], 1)
         fy, cy = np.polyfit(local[:, 1] / local[:, 2], pixels[:, 1], 1)
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    from scipy.linalg import rq
-
     # Directions map to pixels by K R^T, up to scale: two linear equations for each.
     ray = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     middle, scale = pixels.mean(axis=0), pixels.std()
@@ -150,8 +151,6 @@ def _intrinsics(seen: Points, pixels: np.ndarray, turn: Matrix | None) -> Matrix
 
 def _turn(seen: Points, pixels: np.ndarray, intrinsics: Matrix) -> Matrix:
     """Turn of the optical frame that lays the rays of pixels onto the points seen there."""
-    from scipy.spatial.transform import Rotation
-
     rays = np.ones_like(seen)
     rays[:, :2] = (pixels - intrinsics[:2, 2]) / intrinsics.diagonal()[:2]
     lengths = (np.linalg.norm(v, axis=1, keepdims=True) for v in (seen, rays))
@@ -225,8 +224,6 @@ def _towards(points: Points) -> Matrix:
 def _pixel_size(image: np.ndarray, intrinsics: Matrix | None) -> tuple[float, int]:
     """Return the width of a pixel at z = 1, and that of a window that always has a point, in
     pixels and odd."""
-    from scipy.spatial import cKDTree
-
     distinct = np.unique(image.round(7), axis=0)  # of merged clouds
     if len(distinct) < _FEWEST:
         raise ObservationError(f"only {len(distinct)} points are distinct as the camera sees them")

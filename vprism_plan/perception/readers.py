@@ -6,10 +6,9 @@ Units become metres here, once: whole numbers are multiplied by their scale, BOP
 """
 
 import json
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -314,9 +313,8 @@ def save_observation(obs: Observation, path: str | Path) -> None:
     if target.suffix == ".npz":
         content = {key: getattr(obs, key) for key in _SAVED} | {"plane": plane}
         arrays = {key: np.asarray(value) for key, value in content.items() if value is not None}
-        write_atomically(
-            target, lambda stream: np.savez_compressed(stream, allow_pickle=False, **arrays)
-        )
+        with _files.replacing(target) as temporary:
+            np.savez_compressed(temporary, allow_pickle=False, **arrays)
     elif target.is_dir() or (target.suffix == "" and not target.is_file()):
         _save_folder(obs, plane, target)
     else:
@@ -345,7 +343,8 @@ def _save_folder(obs: Observation, plane: list[float] | None, folder: Path) -> N
         if pixels is None:
             path.unlink(missing_ok=True)
         else:
-            write_atomically(path, partial(Image.fromarray(pixels).save, format="PNG"))
+            with _files.replacing(path) as temporary:
+                Image.fromarray(pixels).save(temporary)
     (fx, _, cx), (_, fy, cy), _ = obs.intrinsics.tolist()
     content = {
         "width": obs.shape[1],
@@ -359,9 +358,3 @@ def _save_folder(obs: Observation, plane: list[float] | None, folder: Path) -> N
     }
     present = {key: value for key, value in content.items() if value is not None}
     _files.write_text(folder / "camera.json", json.dumps(present, indent=2) + "\n")
-
-
-def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write through a temporary file beside `path`, so no half-written file ever remains."""
-    with _files.replacing(path) as temporary, temporary.open("wb") as stream:
-        write(stream)

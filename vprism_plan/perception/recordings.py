@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from vprism_plan import _files
 from vprism_plan._arguments import number
@@ -225,8 +226,6 @@ class _Recording:
 
 def _between(child: str, moves: list[tuple[float, str, Pose]], time: float) -> tuple[str, Pose]:
     """Return a frame's parent, and its pose there at a time, between two that were recorded."""
-    from scipy.spatial.transform import Rotation, Slerp
-
     moves = sorted(moves, key=lambda move: move[0])
     after = int(np.searchsorted([move[0] for move in moves], time))
     before, after = max(after - 1, 0), min(after, len(moves) - 1)
@@ -253,8 +252,6 @@ def _seconds(header: Any) -> float:
 
 
 def _transform(message: Any) -> Pose:
-    from scipy.spatial.transform import Rotation
-
     turn, shift = message.rotation, message.translation
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()

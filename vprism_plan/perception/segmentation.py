@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._shapes import Indices, Pixels, PointImage, Points, Values
@@ -137,11 +138,11 @@ def _accept(
     min_area: float,
 ) -> Clusters:
     """Keep the clusters that can be objects on the table; number them by visible area."""
-    accepted: list[tuple[float, int]] = []
     pixels, areas = np.bincount(clusters.ravel()), _areas(clusters, image)
     large = (pixels >= min_points) & (areas >= min_area)
     large[0] = False
-    for cluster in np.flatnonzero(large).tolist():
+    number, order = np.zeros(len(pixels), dtype=np.int32), np.argsort(-areas, kind="stable")
+    for cluster in order[large[order]].tolist():
         member = clusters == cluster
         if np.percentile(image.height[member], 99.0) > max_height:
             continue
@@ -150,10 +151,7 @@ def _accept(
         if size.max() > max_size:
             continue
         if region.contains(points[member], 0.02).mean() >= _MIN_ON_TABLE:
-            accepted.append((-float(areas[cluster]), cluster))
-    number = np.zeros(len(pixels), dtype=np.int32)
-    for label, (_, cluster) in enumerate(sorted(accepted), start=1):
-        number[cluster] = label
+            number[cluster] = number.max() + 1
     return number[clusters]
 
 
@@ -190,8 +188,6 @@ def _areas(clusters: Clusters, image: SurfaceImage) -> Float[np.ndarray, " c"]:
 
 def _attach(clusters: Clusters, raised: Pixels, points: PointImage) -> None:
     """Give raised pixels without a cluster to the nearest one in space, if it is near."""
-    from scipy.spatial import cKDTree
-
     owned = clusters > 0
     loose = raised & ~owned
     if owned.any() and loose.any():
@@ -232,8 +228,6 @@ def _join_fragments(
 
 def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
     """Whether a tenth of the small cluster lies within reach of the big one."""
-    from scipy.spatial import cKDTree
-
     lower, upper = small.min(axis=0) - reach, small.max(axis=0) + reach
     near = big[((big >= lower) & (big <= upper)).all(axis=1)]
     if not len(near):
@@ -244,8 +238,6 @@ def _touch(big: Points, small: Float[np.ndarray, "m 3"], reach: float) -> bool:
 
 def _footprint(flat: np.ndarray) -> np.ndarray | None:
     """Half-planes of the convex hull of a footprint, or None if it has no area."""
-    from scipy.spatial import ConvexHull, QhullError
-
     try:
         return np.asarray(ConvexHull(flat).equations)
     except (QhullError, ValueError):
@@ -279,8 +271,7 @@ def _split_at_valleys(
     order = np.argsort(piece, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
     found = 0
-    # Largest first; the parts of one that falls apart come at once, the last one first.
-    stack = [(nodes, start, end) for nodes in sorted(groups, key=len, reverse=True)][::-1]
+    stack = [(nodes, start, end) for nodes in groups]
     while stack:
         members, first, second = stack.pop()
         parts: list[np.ndarray] = []

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
 
 from vprism_plan._arguments import number
-from vprism_plan._shapes import Pixels, Points, Values
+from vprism_plan._shapes import Points, Values
 from vprism_plan.errors import ObservationError
 from vprism_plan.perception.camera import (
     backproject,
@@ -242,25 +243,15 @@ def _seen_through(observation: Observation, inner: Balls, tolerance: Values) -> 
 def _finished(before: Observation, marked: Observation, remove_flying: bool) -> Observation:
     said = dict.fromkeys([*marked.warnings, *_labels_on_robot(marked)])
     marked = replace(marked, warnings=tuple(said))
-    if remove_flying:
-        flying = _flying_outline(marked)
-        marked = replace(marked, depth=np.where(flying, 0.0, marked.depth))
+    robot, depth = marked.sees_robot, marked.depth
+    beside = ndimage.binary_dilation(robot, np.ones((3, 3), dtype=bool), iterations=2) & ~robot
+    if remove_flying and beside.any():
+        # In place of height over a plane, which may be unknown: every jump in depth counts.
+        flying = flying_pixels(surface_image(depth, marked.intrinsics, depth)) & beside
+        marked = replace(marked, depth=np.where(flying, 0.0, depth))
         logger.info("%d flying pixels along the robot's outline removed", int(flying.sum()))
     logger.info("%d pixels see the robot", int(marked.sees_robot.sum()))
     own = sorted(set(before.object_ids) - set(marked.object_ids))
     if own:
         logger.warning("objects %s are the pictured robot: they are ignored with it", own)
     return marked
-
-
-def _flying_outline(observation: Observation) -> Pixels:
-    """Flying pixels within two pixels of one that sees the robot."""
-    from scipy import ndimage
-
-    robot = observation.sees_robot
-    beside = ndimage.binary_dilation(robot, np.ones((3, 3), dtype=bool), iterations=2) & ~robot
-    if not beside.any():
-        return beside
-    # In place of height over a plane, which may be unknown: every jump in depth counts.
-    image = surface_image(observation.depth, observation.intrinsics, observation.depth)
-    return np.asarray(flying_pixels(image) & beside)

@@ -44,16 +44,6 @@ class MeshFile:
     path: Path | None  # the file, or None if there is none
     searched: tuple[str, ...] = ()  # where it was looked for
 
-    def require(self) -> Path:
-        """Return the file, or raise RobotError that says where it was looked for."""
-        if self.path is None:
-            raise RobotError(
-                f"link '{self.link}' has the mesh '{self.filename}' as collision geometry, and "
-                f"there is no such file; looked for {list(self.searched)}. Pass package_dirs= "
-                "(folders that hold the packages), or spheres= to do without the mesh"
-            )
-        return self.path
-
     def scaled(self, about: Vector, factor: float) -> MeshFile:
         """The same mesh larger or smaller by a factor, about a point of the link's frame."""
         T = _moved(self.T_link, about, factor)
@@ -67,9 +57,21 @@ class MeshFile:
         """
         import trimesh
 
-        path, what = self.require(), f"link '{self.link}'"
+        path, what = self.path, f"link '{self.link}'"
+        if path is None:
+            raise RobotError(
+                f"{what} has the mesh '{self.filename}' as collision geometry, and there is no "
+                f"such file; looked for {list(self.searched)}. Pass package_dirs= (folders that "
+                "hold the packages), or spheres= to do without the mesh"
+            )
         with reading(path, f"a usable mesh of {what}", RobotError, _MOST_BYTES):
-            loaded = _loaded(path, what)
+            scene = read_scene(path)
+            loaded = scene.to_mesh()
+            if len(loaded.faces) == 0:
+                raise RobotError(f"{what}: '{path}' holds no triangles; {_REMEDY}")
+            # COLLADA states its unit.
+            if path.suffix.lower() == ".dae" and scene.units not in (None, "meters"):
+                loaded.apply_scale(trimesh.units.unit_conversion(scene.units, "meters"))
             what = f"{what}, '{path}'"
             read_triangles(loaded, what, math.inf)  # before merging, which is for finite vertices
             vertices = np.asarray(loaded.vertices, dtype=np.float64) * self.scale
@@ -96,20 +98,6 @@ def _moved(T_link: Pose, about: Vector, factor: float) -> Pose:
     return T
 
 
-def _loaded(path: Path, what: str) -> Any:
-    """A file as one mesh, in metres where the file states its unit (COLLADA)."""
-    scene = read_scene(path)
-    units = scene.units if path.suffix.lower() == ".dae" else None
-    mesh = scene.to_mesh()
-    if len(mesh.faces) == 0:
-        raise RobotError(f"{what}: '{path}' holds no triangles; {_REMEDY}")
-    if units not in (None, "meters"):
-        import trimesh
-
-        mesh.apply_scale(trimesh.units.unit_conversion(units, "meters"))
-    return mesh
-
-
 def find_mesh(
     filename: str, urdf: Path, package_dirs: PackageDirs
 ) -> tuple[Path | None, list[str]]:
@@ -132,17 +120,15 @@ def find_mesh(
         places, guesses = _in_packages(rest, folder, package_dirs)
     elif scheme in ("", "file"):
         places = [folder / rest]  # an absolute path replaces the folder
-    found = next((place for place in places if place.is_file()), None)
-    if found is None:
-        found = next((place for place in guesses if place.is_file()), None)
-        places = places + guesses
-        if found is not None:
-            _logger.warning(
-                "no package of the name was found for '%s'; '%s' is taken, whose folder is called "
-                "otherwise: if that is another package's file, pass package_dirs=",
-                *(filename, found),
-            )
-    return found, [str(place) for place in places] or [filename]
+    every = [*places, *guesses]
+    found = next((place for place in every if place.is_file()), None)
+    if found is not None and found not in places:
+        _logger.warning(
+            "no package of the name was found for '%s'; '%s' is taken, whose folder is called "
+            "otherwise: if that is another package's file, pass package_dirs=",
+            *(filename, found),
+        )
+    return found, [str(place) for place in every] or [filename]
 
 
 def _in_packages(

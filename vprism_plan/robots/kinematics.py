@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
-from vprism_plan._read_only import make_read_only
+from vprism_plan._read_only import ReadOnly
 from vprism_plan._shapes import Configurations, Indices, Points, Pose, Spheres, Values, Vector
 from vprism_plan.errors import RobotError
 from vprism_plan.robots.sphere_files import LinkSpheres
@@ -25,7 +26,7 @@ KIND_PRISMATIC = 2
 
 
 @dataclass(frozen=True, eq=False)
-class KinematicArrays:
+class KinematicArrays(ReadOnly):
     """A kinematic tree as C-contiguous float64/int64 arrays, read-only.
 
     Frame 0 is the robot's base; every other frame belongs to one moving joint,
@@ -37,65 +38,37 @@ class KinematicArrays:
         value = q_mult * q[q_index] + q_offset       (mimic joints),
 
     with ``T_0 = [base_R, base_t]``. Metres and radians.
-
-    Attributes:
-        base_R, base_t: Rotation and position of the base in the world.
-        parent: Parent frame, -1 for frame 0.
-        R_off, t_off: Joint frame in its parent frame at joint value 0.
-        axis: Unit joint axis in the joint frame.
-        kind: 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic.
-        q_index: Index into the configuration, -1 for frame 0.
-        q_mult, q_offset: Factor on the configuration value and what is added to it (1 and 0
-            unless the joint mimics).
-        sphere_frame: Frame each sphere moves with.
-        sphere_center: Centre in that frame.
-        sphere_radius: Radius. Spheres are sorted by link, and in it by falling radius.
-        sphere_link: Index into the robot's ``link_names``.
-        link_start: Link l owns the spheres ``link_start[l]:link_start[l + 1]``.
-        link_frame: Frame each link moves with.
-        link_center, link_radius: A ball that holds all spheres of the link.
-        link_fixed: True for links that are not checked against the world: no joint moves them.
-        link_padding: Metres of each link's radii that are padding. They count against the
-            world; a pair's gap is that of its spheres plus the padding of both links.
-        link_buffer: Metres that each link keeps from others, not in its radii.
-        pairs: Link pairs (first < second) to test for self-collision.
-        lower, upper: Joint limits; -pi and pi for continuous joints.
-        continuous: True where the joint turns without limit.
     """
 
-    base_R: Float[np.ndarray, "3 3"]  # noqa: N815
-    base_t: Float[np.ndarray, "3"]
-    parent: Int[np.ndarray, "frames"]
-    R_off: Float[np.ndarray, "frames 3 3"]
+    base_R: Float[np.ndarray, "3 3"]  # noqa: N815  rotation of the base in the world
+    base_t: Float[np.ndarray, "3"]  # its position there
+    parent: Int[np.ndarray, "frames"]  # parent frame, -1 for frame 0
+    R_off: Float[np.ndarray, "frames 3 3"]  # joint frame in its parent frame at joint value 0
     t_off: Float[np.ndarray, "frames 3"]
-    axis: Float[np.ndarray, "frames 3"]
-    kind: Int[np.ndarray, "frames"]
-    q_index: Int[np.ndarray, "frames"]
+    axis: Float[np.ndarray, "frames 3"]  # unit joint axis in the joint frame
+    kind: Int[np.ndarray, "frames"]  # 0 fixed (only frame 0), 1 revolute or continuous, 2 prismatic
+    q_index: Int[np.ndarray, "frames"]  # index into the configuration, -1 for frame 0
+    # Factor on that value and what is added to it: 1 and 0 unless the joint mimics.
     q_mult: Float[np.ndarray, "frames"]
     q_offset: Float[np.ndarray, "frames"]
-    sphere_frame: Int[np.ndarray, "spheres"]
-    sphere_center: Float[np.ndarray, "spheres 3"]
+    # Spheres are sorted by link, and in it by falling radius.
+    sphere_frame: Int[np.ndarray, "spheres"]  # frame each sphere moves with
+    sphere_center: Float[np.ndarray, "spheres 3"]  # in that frame
     sphere_radius: Float[np.ndarray, "spheres"]
-    sphere_link: Int[np.ndarray, "spheres"]
-    link_start: Int[np.ndarray, "links_plus_one"]
-    link_frame: Int[np.ndarray, "links"]
-    link_center: Float[np.ndarray, "links 3"]
+    sphere_link: Int[np.ndarray, "spheres"]  # index into the robot's ``link_names``
+    link_start: Int[np.ndarray, "links_plus_one"]  # link l owns link_start[l]:link_start[l + 1]
+    link_frame: Int[np.ndarray, "links"]  # frame each link moves with
+    link_center: Float[np.ndarray, "links 3"]  # of a ball that holds all spheres of the link
     link_radius: Float[np.ndarray, "links"]
-    link_fixed: Bool[np.ndarray, "links"]
+    link_fixed: Bool[np.ndarray, "links"]  # not checked against the world: no joint moves it
+    # Metres of each link's radii that are padding. They count against the world; a pair's gap
+    # is that of its spheres plus the padding of both links.
     link_padding: Float[np.ndarray, "links"]
-    link_buffer: Float[np.ndarray, "links"]
-    pairs: Int[np.ndarray, "pairs 2"]
-    lower: Float[np.ndarray, "dof"]
+    link_buffer: Float[np.ndarray, "links"]  # metres kept from other links, not in the radii
+    pairs: Int[np.ndarray, "pairs 2"]  # of links, first < second, to test for self-collision
+    lower: Float[np.ndarray, "dof"]  # joint limits; -pi and pi for continuous joints
     upper: Float[np.ndarray, "dof"]
-    continuous: Bool[np.ndarray, "dof"]
-
-    def __post_init__(self) -> None:
-        """Keep users of the robot's limits and radii from changing those of every checker."""
-        make_read_only(self.__dict__)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        make_read_only(state)
+    continuous: Bool[np.ndarray, "dof"]  # where the joint turns without limit
 
 
 @dataclass(frozen=True)
@@ -105,16 +78,6 @@ class Attachment:
     frame: int
     T: np.ndarray
     parent: str = ""
-
-
-def rotation(
-    axis: Vector, angle: Float[np.ndarray, "*batch"] | np.float64
-) -> Float[np.ndarray, "*batch 3 3"]:
-    """Rotation matrices about a unit axis (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    s, c = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
-    return np.eye(3) + s * K + (1.0 - c) * (K @ K)
 
 
 def build_arrays(
@@ -135,23 +98,21 @@ def build_arrays(
     links = {model.root: Attachment(0, np.eye(4))}
     for joint in model.joints:
         parent = links[joint.parent]
-        T = parent.T @ joint.T_origin
-        if not joint.moves:
-            links[joint.child] = Attachment(parent.frame, T, joint.parent)
-            continue
+        frame, T = parent.frame, parent.T @ joint.T_origin
         driver, factor, shift = model.resolve_mimic(joint.name)
-        if driver in active:
+        if joint.moves and driver in active:
             kind = KIND_PRISMATIC if joint.kind == "prismatic" else KIND_REVOLUTE
             index = list(active).index(driver)
-            frames.append((parent.frame, T, joint.axis, kind, index, factor, shift))
-            links[joint.child] = Attachment(len(frames) - 1, np.eye(4), joint.parent)
-        else:
-            value, motion = np.float64(factor * locked[driver] + shift), np.eye(4)
+            frames.append((frame, T, joint.axis, kind, index, factor, shift))
+            frame, T = len(frames) - 1, np.eye(4)
+        elif joint.moves:
+            motion, way = np.eye(4), (factor * locked[driver] + shift) * joint.axis
             if joint.kind == "prismatic":
-                motion[:3, 3] = value * joint.axis
+                motion[:3, 3] = way
             else:
-                motion[:3, :3] = rotation(joint.axis, value)
-            links[joint.child] = Attachment(parent.frame, T @ motion, joint.parent)
+                motion[:3, :3] = Rotation.from_rotvec(way).as_matrix()
+            T = T @ motion
+        links[joint.child] = Attachment(frame, T, joint.parent)
     chosen = [model.joint_map[name] for name in active]
     centers, radii, ball_centers, ball_radii = zip(
         *(in_frame(links[name], rows) for name, rows in spheres.items()), strict=True
@@ -230,7 +191,8 @@ def frame_poses(
         if arrays.kind[f] == KIND_PRISMATIC:
             t[:, f] += value[:, None] * (R[:, f] @ arrays.axis[f])
         else:
-            R[:, f] = R[:, f] @ rotation(arrays.axis[f], value)
+            turn = Rotation.from_rotvec(value[:, None] * arrays.axis[f])
+            R[:, f] = R[:, f] @ turn.as_matrix()
     return R, t
 
 

@@ -74,15 +74,8 @@ def choose_pairs(
 
 def _adjacent(model: RobotModel, bodies: set[str]) -> set[frozenset[str]]:
     """Each collision link with its nearest ancestor that is one too."""
-    above = {joint.child: joint.parent for joint in model.joints}
-    pairs = set()
-    for link in bodies:
-        parent = above.get(link)
-        while parent is not None and parent not in bodies:
-            parent = above.get(parent)
-        if parent is not None:
-            pairs.add(frozenset((link, parent)))
-    return pairs
+    nearest = ([name for name in model.above(link) if name in bodies][:2] for link in bodies)
+    return {frozenset(pair) for pair in nearest if len(pair) == 2}
 
 
 def _touching_fits(arrays: KinematicArrays, pairs: Pairs, chosen: ChosenSpheres) -> Reasons:
@@ -103,13 +96,9 @@ def _touching_fits(arrays: KinematicArrays, pairs: Pairs, chosen: ChosenSpheres)
 
 def hangs_on(model: RobotModel, joints: Collection[str], pair: frozenset[str]) -> bool:
     """Whether any of these joints, or one that mimics it, moves two links against each other."""
-    above = {joint.child: joint for joint in model.joints}
-    between: set[str] = set()
-    for end in pair:
-        link = end
-        while link in above:
-            between ^= {above[link].name}  # what is above both moves neither against the other
-            link = above[link].parent
+    first, second = (set(model.above(link)) for link in pair)
+    # What is above both moves neither against the other.
+    between = [model.joint_above[link].name for link in first ^ second]
     return any(model.resolve_mimic(name)[0] in joints for name in between)
 
 
@@ -208,16 +197,6 @@ def touching_pairs(
     """Names of the tested pairs whose spheres overlap at one configuration."""
     touching = pairs_touching(arrays, q[None], arrays.pairs)[0]
     return {(names[a], names[b]) for a, b in arrays.pairs[touching]}
-
-
-def touching_shares(
-    arrays: KinematicArrays, names: Sequence[str], samples: int, seed: int
-) -> dict[frozenset[str], float]:
-    """See :meth:`Robot.touching_shares`."""
-    q = random_configurations(arrays, samples, np.random.default_rng(seed))
-    shares = pairs_touching(arrays, q, arrays.pairs).mean(axis=0)
-    pairs = [frozenset((names[a], names[b])) for a, b in arrays.pairs]
-    return dict(zip(pairs, shares.tolist(), strict=True))
 
 
 def random_configurations(arrays: KinematicArrays, n: int, rng: Generator) -> Configurations:

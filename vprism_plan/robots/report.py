@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from vprism_plan._shapes import Points, Spheres, Triangles, Values
 from vprism_plan.robots.geometry import PrimitiveGeometry
@@ -282,8 +283,6 @@ def protrusion(
 
 def _mesh_distance(triangles: Triangles, points: Points) -> Values:
     """Distance to a surface, 0 where the surface encloses the point."""
-    from scipy.spatial import cKDTree
-
     triangles = with_hull(triangles)
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     edge = max(0.003, float((high - low).max()) / 60.0)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from vprism_plan._arguments import rigid_pose
-from vprism_plan._read_only import make_read_only
+from vprism_plan._read_only import ReadOnly
 from vprism_plan._shapes import Pairs, Pose
 from vprism_plan.errors import RobotError
 from vprism_plan.robots import changes, kinematics, pairs, surfaces
@@ -44,7 +44,7 @@ class _Parts:
 
 
 @dataclass(frozen=True, eq=False)
-class Robot:
+class Robot(ReadOnly):
     """A robot read from a URDF; build it with :meth:`from_urdf`.
 
     A configuration ``q`` has one value per name in ``joint_names``: radians for revolute and
@@ -111,13 +111,6 @@ class Robot:
     _changes: tuple[tuple[str, dict[str, Any]], ...] = field(default=(), repr=False)
     attached: dict[str, str] = field(default_factory=dict)
     held: dict[str, Held] = field(default_factory=dict, repr=False)
-
-    def __post_init__(self) -> None:
-        make_read_only(self.__dict__)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        make_read_only(state)
 
     @classmethod
     def from_urdf(
@@ -228,7 +221,7 @@ class Robot:
             link_names=tuple(chosen.rows),
             geometry=solids,
             named_states=states,
-            groups=semantics.group_links,
+            groups=semantics.groups,
             disabled_pairs=disabled,
             arrays=arrays,
             links=links,
@@ -542,7 +535,10 @@ class Robot:
         Returns:
             Unordered pair of ``collision_pairs`` -> share of the configurations, 0 to 1.
         """
-        return pairs.touching_shares(self.arrays, self.link_names, samples, seed)
+        q = pairs.random_configurations(self.arrays, samples, np.random.default_rng(seed))
+        shares = pairs.pairs_touching(self.arrays, q, self.collision_pairs).mean(axis=0)
+        names = [frozenset(self.link_names[i] for i in pair) for pair in self.collision_pairs]
+        return dict(zip(names, shares.tolist(), strict=True))
 
     def write_spheres(self, path: str | Path) -> None:
         """Write ``link_spheres`` as YAML, to be read bit by bit as ``<stem>_spheres.yml``.

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -208,53 +207,43 @@ def _yaml(path: Path) -> Any:
     if not path.is_file():
         raise RobotError(f"no sphere file at '{path}'; give an existing YAML or XRDF file")
     with reading(path, "valid YAML", RobotError, _MOST_BYTES):
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_loader())
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
+        root = loader.get_single_node()
+        if root is not None:
+            _check_values(root, {})
+            root = loader.construct_document(root)
+        return root
 
 
-@functools.cache
-def _loader() -> Any:
-    """YAML's safe loader, without a second list for a link, or aliases that no memory holds."""
+def _check_values(node: Any, sizes: dict[int, int]) -> int:
+    """Count the values of a YAML node, those that aliases stand for too; refuse more than memory
+    holds, and a second list for a link."""
     import yaml
 
-    class Loader(yaml.SafeLoader):
-        def __init__(self, stream: Any) -> None:
-            super().__init__(stream)
-            self._values = 0  # so far, with all that aliases stand for
-            self._sizes: dict[int, int] = {}
-
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            mark, alias = self.peek_event().start_mark, self.check_event(yaml.AliasEvent)
-            before = self._values
-            node = super().compose_node(parent, index)
-            # What an alias in its own list or mapping stands for has no end.
-            self._values += self._sizes.get(id(node), _MOST_VALUES + 1) if alias else 1
-            problem = None
-            if self._values > _MOST_VALUES:
-                problem = f"with aliases written out it has more than {_MOST_VALUES:,} values"
-            elif isinstance(node, yaml.ScalarNode) and len(node.value) > _LONGEST_VALUE:
-                problem = f"a value of more than {_LONGEST_VALUE:,} characters"
-            if problem is not None:
-                raise yaml.composer.ComposerError(problem=problem, problem_mark=mark)
-            if not alias:
-                self._sizes[id(node)] = self._values - before
-            return node
-
-        def compose_mapping_node(self, anchor: Any) -> Any:
-            node = super().compose_mapping_node(anchor)
-            seen = set()
-            for key, _ in node.value:
-                problem = None
-                if not isinstance(key, yaml.ScalarNode):
-                    problem = "a key is no plain name"
-                elif key.value in seen:
-                    problem = f"the key '{key.value}' occurs twice; join the two"
-                if problem is not None:
-                    mark = key.start_mark
-                    raise yaml.constructor.ConstructorError(problem=problem, problem_mark=mark)
-                seen.add(key.value)
-            return node
-
-    return Loader
+    # Until it is known: what an alias in its own list or mapping stands for has no end.
+    sizes[id(node)] = _MOST_VALUES
+    parts, problem, mark = [], None, node.start_mark
+    if isinstance(node, yaml.ScalarNode):
+        if len(node.value) > _LONGEST_VALUE:
+            problem = f"a value of more than {_LONGEST_VALUE:,} characters"
+    elif isinstance(node, yaml.MappingNode):
+        parts, names = [part for pair in node.value for part in pair], set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                problem, mark = "a key is no plain name", key.start_mark
+            elif key.value in names:
+                problem, mark = f"the key '{key.value}' occurs twice; join the two", key.start_mark
+            else:
+                names.add(key.value)
+    else:
+        parts = node.value
+    size = 1 + sum(sizes.get(id(part)) or _check_values(part, sizes) for part in parts)
+    if size > _MOST_VALUES:
+        problem = f"with aliases written out it has more than {_MOST_VALUES:,} values"
+    if problem is not None:
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
+    sizes[id(node)] = size
+    return size
 
 
 def _from_curobo(kinematics: Any, source: str, folder: Path) -> SphereTable:

@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.distance import cdist
 
 from vprism_plan._arguments import number, whole
 from vprism_plan._files import cache_folder, replacing
@@ -234,8 +235,6 @@ def _settled(surface: Surface, centres: Points) -> tuple[Spheres, float]:
 
 def _moved(surface: Surface, centre: Vector, own: Indices) -> Vector:
     """Where a sphere that holds these triangles stands out least, by a pattern search."""
-    from scipy.spatial.distance import cdist
-
     points = surface.points[np.unique(surface.faces[own])]
 
     def cost(x: np.ndarray) -> np.ndarray:
@@ -333,16 +332,14 @@ def enclosing_spheres(solid: PrimitiveGeometry) -> Spheres:
 
 def _tile_cylinder(radius: float, length: float) -> Spheres:
     """A ball on the axis and rings of balls around it, repeated along the axis."""
-    edge = _TILE_EDGE
+    edge = max(_TILE_EDGE, radius / 5.0)  # five rings are more than the most tiles
     while True:
-        rings = math.ceil(radius / edge)
+        disc = _tile_disc(radius, edge)
         # A slender cylinder gains nothing from slices much thinner than it is wide.
         slices = math.ceil(length / max(0.5 * edge, min(edge, radius)))
-        count = 1 + int(_sectors(radius, rings, edge).sum())
-        if count * slices <= _MAX_TILES or count == slices == 1:
+        if len(disc) * slices <= _MAX_TILES:
             break
         edge *= 1.1
-    disc = _tile_disc(radius, rings, edge)
     step = length / slices
     heights = (np.arange(slices) + 0.5) * step - 0.5 * length
     rows = np.empty((slices, len(disc), 4))
@@ -352,23 +349,19 @@ def _tile_cylinder(radius: float, length: float) -> Spheres:
     return rows.reshape(-1, 4)
 
 
-def _sectors(radius: float, rings: int, edge: float) -> Indices:
-    """Into how many sectors each ring of a disc but the innermost is cut."""
-    outer = np.arange(2, rings + 1) * (radius / rings)
-    return np.maximum(4, np.ceil(2 * math.pi * outer / edge)).astype(np.int64)
-
-
-def _tile_disc(radius: float, rings: int, edge: float) -> Points:
-    """Circles (x, y, radius) whose union holds a disc."""
+def _tile_disc(radius: float, edge: float) -> Points:
+    """Circles (x, y, radius) whose union holds a disc: one in the middle, and rings of sectors."""
+    rings = math.ceil(radius / edge)
     width = radius / rings
     circles = [np.array([[0.0, 0.0, width]])]
-    for ring, n in enumerate(_sectors(radius, rings, edge).tolist(), start=1):
+    for ring in range(1, rings):
         inner, outer = ring * width, (ring + 1) * width
+        n = max(4, math.ceil(2 * math.pi * outer / edge))
         half = math.pi / n
         # Equally far from the sector's inner and outer corners.
         middle = (inner + outer) / (2 * math.cos(half))
         reach = math.hypot(outer * math.cos(half) - middle, outer * math.sin(half))
-        turn = 2 * math.pi * np.arange(n) / n
+        turn = 2 * half * np.arange(n)
         circles.append(
             np.column_stack([middle * np.cos(turn), middle * np.sin(turn), np.full(n, reach)])
         )

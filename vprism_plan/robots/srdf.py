@@ -28,8 +28,7 @@ _logger = logging.getLogger(__name__)
 class SemanticModel:
     """What an SRDF adds to a URDF, in file order."""
 
-    groups: Names = field(default_factory=dict)  # of joints
-    group_links: Names = field(default_factory=dict)
+    groups: Names = field(default_factory=dict)  # of links
     # (state, group) -> joint -> value
     states: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
     disabled: dict[frozenset[str], str] = field(default_factory=dict)  # pair -> reason
@@ -66,13 +65,13 @@ def load_srdf(path: str | Path, model: RobotModel) -> SemanticModel:
     with reading(path, "a usable SRDF", RobotError, MOST_BYTES):
         root = robot_element(path, "an SRDF")
         missing: Missing = set()
-        groups, links = _groups(root, model, missing, path)
+        groups = _groups(root, model, missing, path)
         states, disabled = _states(root, model, missing, path), _disabled(root, model, missing)
         # A virtual joint ties the base to the world; it is no joint of the URDF.
         missing -= {("joint", element.get("name", "")) for element in root.findall("virtual_joint")}
         named = ", ".join(sorted(f"{what} '{name}'" for what, name in missing))
         odd = f"'{path}' names what {model.name} does not have, left out: {named}"
-        return SemanticModel(groups, links, states, disabled, (odd,) if missing else ())
+        return SemanticModel(groups, states, disabled, (odd,) if missing else ())
 
 
 Missing = set[tuple[str, str]]  # "joint", "link" or "group", and a name in vain
@@ -85,61 +84,39 @@ def _has(what: str, name: str, valid: Collection[str], missing: Missing) -> bool
     return name in valid
 
 
-def _groups(
-    root: ET.Element, model: RobotModel, missing: Missing, path: Path
-) -> tuple[Names, Names]:
-    """The joints and the links of every group: as in MoveIt, what its joints move directly."""
-    parent_of = {joint.child: joint for joint in model.joints}
+def _groups(root: ET.Element, model: RobotModel, missing: Missing, path: Path) -> Names:
+    """The links of every group: as in MoveIt, what its joints move directly."""
+    elements = {element.get("name", ""): element for element in root.findall("group")}
+    tables: dict[str, Any] = {"joint": model.joint_map, "link": model.links, "group": elements}
+    groups: Names = {}
 
     def chain(group: str, base: str, tip: str) -> list[str]:
         if not all(_has("link", end, model.links, missing) for end in (base, tip)):
             return []
-        links: list[str] = []
-        link = tip
-        while link != base:
-            if link not in parent_of:
-                raise RobotError(f"group '{group}' in '{path}': '{base}' is not above '{tip}'")
-            links.insert(0, link)
-            link = parent_of[link].parent
-        return links
+        above = model.above(tip)
+        if base not in above:
+            raise RobotError(f"group '{group}' in '{path}': '{base}' is not above '{tip}'")
+        return above[: above.index(base)][::-1]
 
-    elements = {element.get("name", ""): element for element in root.findall("group")}
-    tables: dict[str, Any] = {"joint": model.joint_map, "link": model.links, "group": elements}
-    groups: Names = {}
-    group_links: Names = {}
-    begun: list[str] = []
-
-    def read(group: str) -> None:
+    def read(group: str, above: tuple[str, ...] = ()) -> tuple[str, ...]:
+        if group in above:
+            raise RobotError(f"group '{group}' in '{path}' is in itself, through {list(above)}")
         if group in groups:
-            return
-        if group in begun:
-            raise RobotError(f"group '{group}' in '{path}' is in itself, through {begun}")
-        begun.append(group)
-        joints, links = list[str](), list[str]()
+            return groups[group]
+        links: list[str] = []
         for member in elements[group]:
             name, kind = member.get("name", ""), member.tag
             if kind == "chain":
-                below = chain(group, member.get("base_link", ""), member.get("tip_link", ""))
-                joints += [parent_of[link].name for link in below]
-                links += below
-            elif kind not in tables or not _has(kind, name, tables[kind], missing):
-                continue
-            elif kind == "group":
-                read(name)
-                joints += groups[name]
-                links += group_links[name]
-            elif kind == "joint":
-                joints.append(name)
-                links.append(model.joint_map[name].child)
-            else:
-                links.append(name)
-                joints += [parent_of[name].name] if name in parent_of else []
-        groups[group] = tuple(dict.fromkeys(joints))
-        group_links[group] = tuple(dict.fromkeys(links))
+                links += chain(group, member.get("base_link", ""), member.get("tip_link", ""))
+            elif kind in tables and _has(kind, name, tables[kind], missing):
+                one = model.joint_map[name].child if kind == "joint" else name
+                links += read(name, (*above, group)) if kind == "group" else (one,)
+        groups[group] = tuple(dict.fromkeys(links))
+        return groups[group]
 
     for name in elements:
         read(name)
-    return groups, group_links
+    return groups
 
 
 def _states(
@@ -172,16 +149,20 @@ def choose_joints(
 ) -> tuple[str, ...]:
     """The joints of a configuration: given, of the group, of the group "arm", or else all."""
     valid = model.movable
+
+    def of(name: str) -> list[str]:
+        joints = (model.joint_above.get(link) for link in semantics.groups.get(name, ()))
+        return [joint.name for joint in joints if joint is not None and joint.name in valid]
+
     if group is not None:
         if joints is not None:
             raise RobotError(f"both joints and the group {group!r} are given; give one of them")
-        joints = [name for name in semantics.groups.get(group, ()) if name in valid]
+        joints = of(group)
         if not joints:
             found = f"the SRDF of '{model.name}' has no group {group!r} with joints that move"
             raise RobotError(f"{found}; groups: {sorted(semantics.groups)}")
     if joints is None:
-        arm = [name for name in semantics.groups.get("arm", ()) if name in valid]
-        chosen = tuple(arm) or valid
+        chosen = tuple(of("arm")) or valid
     elif isinstance(joints, str):
         raise RobotError(f"joints is the string {joints!r}; give a sequence of joint names")
     else:

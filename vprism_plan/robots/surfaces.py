@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial.distance import cdist
 
 from vprism_plan._shapes import Points, Pose, Spheres, Triangles, Values, Vector
 from vprism_plan.errors import RobotError
@@ -44,9 +47,6 @@ class Surface:
     def of(cls, triangles: Triangles, tolerance: float, most: int | None = None) -> Surface:
         """Cut a surface so that spheres which stand out by the tolerance can hold its parts:
         triangles, or boxes around them where there would be more than so many."""
-        from scipy import ndimage
-        from scipy.spatial import cKDTree
-
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         longest = float((high - low).max())
         cell = float(np.cbrt((high - low).prod())) / _CELLS
@@ -75,18 +75,14 @@ class Surface:
 
     def reach(self, centres: Points) -> Float[np.ndarray, "c t"]:
         """Distance from each centre to the farthest corner of each triangle."""
-        from scipy.spatial.distance import cdist
-
         away = cdist(centres, self.points)
         corners = (away[:, corner] for corner in self.faces.T)
         return np.asarray(functools.reduce(np.maximum, corners))
 
     def signed(self, x: Points) -> Values:
         """Signed distance, interpolated between cells; negative inside."""
-        from scipy.ndimage import map_coordinates
-
         at = (x - self.lower) / self.cell - 0.5
-        return np.asarray(map_coordinates(self.lattice, at.T, order=1, mode="nearest"))
+        return np.asarray(ndimage.map_coordinates(self.lattice, at.T, order=1, mode="nearest"))
 
 
 def with_hull(triangles: Triangles) -> Triangles:
@@ -96,7 +92,6 @@ def with_hull(triangles: Triangles) -> Triangles:
     the link counts as solid up to its hull.
     """
     import trimesh
-    from scipy.spatial import ConvexHull, QhullError
 
     if trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=True).is_watertight:
         return triangles
@@ -169,15 +164,11 @@ def surface_samples(triangles: Triangles, count: int = _SAMPLES, seed: int = 0) 
 
 def drawn_points(triangles: Triangles, count: int, seed: int = 0) -> tuple[Points, Points]:
     """Points of a surface, uniform by area, and the unit normals of their triangles."""
-    rng = np.random.default_rng(seed)
-    edges = triangles[:, 1:] - triangles[:, :1]
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    area = np.linalg.norm(normal, axis=1)
-    which = rng.choice(len(triangles), size=count, p=area / area.sum())
-    share = rng.random((count, 2))
-    share = np.where(share.sum(axis=1, keepdims=True) > 1.0, 1.0 - share, share)
-    points = triangles[which, 0] + np.einsum("nk,nkj->nj", share, edges[which])
-    return points, normal[which] / area[which, None]
+    import trimesh
+
+    mesh = trimesh.Trimesh(**trimesh.triangles.to_kwargs(triangles), process=False)
+    points, which = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    return np.asarray(points), np.asarray(mesh.face_normals[which])
 
 
 # ------------------------------------------------------------------------ balls inside solids
@@ -276,8 +267,6 @@ def _of_mesh(triangles: Triangles) -> Spheres:
     In triangles without an edge longer than `_APART` every point is at most that over sqrt(3)
     from a corner, square to the way from the middle to the nearest point: a cathetus at least.
     """
-    from scipy.spatial import cKDTree
-
     surface = Surface.of(triangles, math.inf)
     corners = split_triangles(triangles, _APART).reshape(-1, 3)
     middles = surface.lower + surface.cell * (np.argwhere(surface.whole) + 0.5)
@@ -290,8 +279,6 @@ def _of_mesh(triangles: Triangles) -> Spheres:
 
 def _cover(rows: Spheres) -> Spheres:
     """Balls, chosen greedily, that hold (up to `_SHORT`) middles near the surface and others."""
-    from scipy.spatial import cKDTree
-
     near = rows[:, 3] < _APART
     aimed = np.concatenate([rows[near, :3], rows[~near, :3][::_INNER_SHARE]])
     if not len(aimed):

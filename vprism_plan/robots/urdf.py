@@ -69,6 +69,18 @@ class RobotModel:
         """The joints by name."""
         return {joint.name: joint for joint in self.joints}
 
+    @functools.cached_property
+    def joint_above(self) -> dict[str, Joint]:
+        """The joint that each link but the root hangs on."""
+        return {joint.child: joint for joint in self.joints}
+
+    def above(self, link: str) -> list[str]:
+        """The links from one up to the root, itself first."""
+        links = [link]
+        while links[-1] in self.joint_above:
+            links.append(self.joint_above[links[-1]].parent)
+        return links
+
     @property
     def actuated(self) -> tuple[str, ...]:
         """Names of the joints that move and do not mimic another."""
@@ -135,7 +147,7 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
             raise RobotError(f"'{path}' has {len(links):,} links; at most {_MOST_LINKS:,} are read")
         return build_tree(
             root.get("name", path.stem),
-            [_named(_link, element, path, package_dirs) for element in links],
+            [_named(_link, element, path, path, package_dirs) for element in links],
             [_named(_joint, element, path) for element in root.findall("joint")],
             path,
         )
@@ -143,18 +155,15 @@ def load_model(path: str | Path, package_dirs: PackageDirs = None) -> RobotModel
 
 def _named(read: Callable[..., Any], element: ET.Element, path: Path, *others: Any) -> Any:
     """Read a link or a joint; what is wrong in it is said with its name."""
-    try:
-        return read(element, path, *others)
-    except (KeyError, ValueError, TypeError) as error:
-        what = f"no {error}" if isinstance(error, KeyError) else str(error)
-        raise RobotError(f"{element.tag} '{element.get('name')}' in '{path}': {what}") from error
-
-
-def _name(element: ET.Element, path: Path) -> str:
     name = element.get("name")
     if not name:
         raise RobotError(f"a <{element.tag}> in '{path}' has no 'name'")
-    return name
+    whose = f"{element.tag} '{name}' in '{path}'"
+    try:
+        return read(element, name, whose, *others)
+    except (KeyError, ValueError, TypeError) as error:
+        what = f"no {error}" if isinstance(error, KeyError) else str(error)
+        raise RobotError(f"{whose}: {what}") from error
 
 
 def _numbers(text: str) -> list[float]:
@@ -187,10 +196,10 @@ def _origin(owner: ET.Element, whose: str) -> np.ndarray:
     return np.array(T, dtype=np.float64)
 
 
-def _link(element: ET.Element, path: Path, package_dirs: PackageDirs) -> Link:
+def _link(
+    element: ET.Element, name: str, whose: str, path: Path, package_dirs: PackageDirs
+) -> Link:
     primitives, meshes = [], []
-    name = _name(element, path)
-    whose = f"link '{name}' in '{path}'"
     for collision in element.findall("collision"):
         T = _origin(collision, whose)
         shape = collision.find("geometry/*")
@@ -236,10 +245,8 @@ def _primitives(shape: ET.Element, T: np.ndarray, whose: str) -> list[PrimitiveG
     return [PrimitiveGeometry("cylinder", size, T), *ends]
 
 
-def _joint(element: ET.Element, path: Path) -> Joint:
-    name, kind = _name(element, path), element.get("type", "")
-    whose = f"joint '{name}' in '{path}'"
-    ends = {}
+def _joint(element: ET.Element, name: str, whose: str) -> Joint:
+    kind, ends = element.get("type", ""), {}
     for part in ("parent", "child"):
         end = element.find(part)
         ends[part] = "" if end is None else end.get("link", "")
