@@ -46,7 +46,7 @@ from vprism_plan.mapping.training_data import (
     stray_points,
     sunk_objects,
 )
-from vprism_plan.perception.camera import point_image
+from vprism_plan.perception.camera import backproject, transform_points
 from vprism_plan.perception.masks import drop_background
 from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
@@ -391,7 +391,7 @@ def _marked_points(view: Observation) -> tuple[Points, Indices, Points]:
     if view.clear is None:
         return points, labels, points
     kept, gone = view.depth > 0, (view.depth == 0) & (view.clear > 0)
-    image = point_image(view.clear, view.intrinsics, view.pose)
+    image = transform_points(view.pose, backproject(view.clear, view.intrinsics))
     cut = (view.clear < view.depth)[kept]
     ends = np.where(cut[:, None], image[kept], points)
     ends = np.where((view.clear > 0)[kept][:, None], ends, view.camera_center)
