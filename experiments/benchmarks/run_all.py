@@ -9,7 +9,17 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-ORDER = ("answer", "checking", "ompl_callbacks", "bake", "predict", "fit", "risk", "mesh_checker")
+ORDER = (
+    "answer",
+    "checking",
+    "ompl_callbacks",
+    "bake",
+    "predict",
+    "fit",
+    "risk",
+    "mesh_checker",
+    "distances",
+)
 
 
 def main() -> None:

@@ -21,6 +21,7 @@ from vprism_plan.collision.packing import (
     AT_MOST,
     MARGIN,
     Configuration,
+    PackedWorld,
     Rows,
     Waypoints,
     pack_robot,
@@ -61,8 +62,8 @@ class Certain:
         return [self._world.certain_field(ids) for ids in self.rules]
 
     @cached_property
-    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same for the kernels: distances, block bounds, floats."""
+    def packed(self) -> PackedWorld:
+        """The same for the kernels: distances, block bounds, near distances, floats."""
         return pack_world(self._world, self.fields, 0.0)
 
 
@@ -88,12 +89,12 @@ class Setting:
     margin: float = 0.0  # metres to keep from what is certain; in `radii` already
 
     @cached_property
-    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same for the kernels, with the margin: distances, block bounds, floats."""
-        distance, blocks, floats = self.certain.packed
+    def packed(self) -> PackedWorld:
+        """The same for the kernels, with the margin."""
+        distance, blocks, near, floats = self.certain.packed
         floats = floats.copy()
         floats[MARGIN] += self.margin
-        return distance, blocks, floats
+        return distance, blocks, near, floats
 
 
 def grown(setting: Setting, voxels: float) -> Setting:
