@@ -433,9 +433,9 @@ def guess_bounds(
 
 @njit(cache=True, nogil=True, inline="always")
 def _shared(grid, p, fade, other):
-    """Value of a grid at an index p (3,), fading into another value at its sides."""
+    """Value of a grid at an index p (3,), fading into another value at its sides if `fade` > 0."""
     share = 1.0
-    for axis in range(3):
+    for axis in range(3 if fade > 0.0 else 0):
         share = min(share, p[axis] / fade, (grid.shape[axis] - 1.0 - p[axis]) / fade)
     return other + max(share, 0.0) * (_trilinear(grid, p[0], p[1], p[2]) - other)
 
@@ -499,7 +499,7 @@ def guess_bulges(
     C = len(grids)
     ends, of = np.empty(2), np.empty((C, 4))
     least, most = np.empty(C), np.empty(C)
-    corners, at = np.empty((8, 3)), np.empty((8, 1 + C))
+    nodes, at = np.empty((27, 3)), np.empty((27, 1 + C))
     for i in range(start, stop):
         inside = _around(
             centers[i], half, poses, grids, node_pose, elsewhere, fade, empty, of, ends
@@ -514,7 +514,7 @@ def guess_bulges(
         known = False
         outside = ends[1] - ends[0]
         if outside > 0.0 and not inside:
-            outside = _off_plane(elsewhere, node_pose, centers[i], half, 1e-9, 0.0)
+            outside = _off_plane(elsewhere, node_pose, centers[i], half, 0.0, 0.0)
         up, down = 0.0, 0.0
         for c in range(C):
             over = under = most[c] - least[c]
@@ -526,11 +526,11 @@ def guess_bulges(
                 if of[c, 2] < fade:
                     if not known:
                         known = True
-                        for k in range(8):
-                            for axis in range(3):
-                                side = half if k >> axis & 1 else -half
-                                corners[k, axis] = centers[i, axis] + side
-                        guesses(corners, poses, grids, node_pose, elsewhere, fade, empty, at, 0, 8)
+                        for k in range(27):
+                            nodes[k, 0] = centers[i, 0] + half * (k // 9 - 1)
+                            nodes[k, 1] = centers[i, 1] + half * (k // 3 % 3 - 1)
+                            nodes[k, 2] = centers[i, 2] + half * (k % 3 - 1)
+                        guesses(nodes, poses, grids, node_pose, elsewhere, fade, empty, at, 0, 27)
                     over, under = most[c] - at[:, 1 + c].min(), at[:, 1 + c].max() - least[c]
                 if of[c, 3] > 0.0 and of[c, 2] < fade:
                     low, high = max(of[c, 2], 0.0) / fade, min(of[c, 3] / fade, 1.0)

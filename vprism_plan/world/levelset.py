@@ -226,6 +226,12 @@ class _Bounds:
     guess: Float[np.ndarray, "m k"] | None
     shares: Float32[np.ndarray, "m c"]
 
+    def slack(self, step: float) -> Values:
+        """By how much log-odds may exceed those at the nodes, but for the guess's kinks."""
+        # Second differences are the kinks' as well: enough for a part that is smooth.
+        known = self.prior is not None and self.guess is None
+        return _slack(self.g.reshape(-1, 3, 3, 3), step, 1.0 if known else _CURVATURE_SAFETY)
+
     def over(
         self, rows: Any, nodes: Any, middle: Float[np.ndarray, "r 3"], half: float, slack: Any = 0.0
     ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
@@ -260,8 +266,11 @@ def _divide(
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
-    least, most = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, -np.inf)
-    below, above = (_slack(part.reshape(g.shape), step) for part in (least, most))
+    slack = bounds.slack(step)
+    least, most = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, slack)
+    below = above = slack
+    if bounds.guess is not None:
+        below, above = (_slack(part.reshape(g.shape), step) for part in (least, most))
     inside, border = [], []
     for child in _CHILDREN:
         nodes = (child + _CHILDREN) @ [9, 3, 1]
@@ -280,11 +289,13 @@ def _divide(
     return _join(inside), _join(border)
 
 
-def _slack(g: Float[np.ndarray, "n 3 3 3"], step: float) -> Values:
+def _slack(
+    g: Float[np.ndarray, "n 3 3 3"], step: float, safety: float = _CURVATURE_SAFETY
+) -> Values:
     """By how much log-odds in a cell may exceed those at the corners of its eighths."""
     # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
     spread = np.ptp(g, axis=(1, 2, 3))
-    return _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
+    return safety * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
 
 
 def _ownership(
@@ -312,10 +323,10 @@ def _border(
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`) into those inside and those to keep, each with a plane that
     the level set does not cross in it: by what log-odds differ from linear at its corners."""
-    slack = _slack(g, step)
+    slack = bounds.slack(step)
     ends = ((g.take(2, axis) - g.take(0, axis)) / (2.0 * size) for axis in (1, 2, 3))
     normals = np.stack([-part.mean(axis=(1, 2)) for part in ends], axis=1)
-    rough = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, -np.inf)[1]
+    rough = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, slack)[1]
     inside, kept = [], []
     for child in _CHILDREN:
         nodes = (child + _CHILDREN) @ [9, 3, 1]
