@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,15 +48,17 @@ class Planed:
     cells: tuple[tuple[Index, int, Float32[np.ndarray, "n 4"]], ...]  # index, size, planes
     factor: int  # lattice steps per grid step
 
-    def nodes(self, grid: Grid) -> Nodes:
-        """Distances (m, rounded down) of a grid's nodes up to `NEAR_REACH`, no more elsewhere."""
+    def nodes(self, grid: Grid, cells: Nodes) -> Nodes:
+        """Distances (m, rounded down) of a grid's nodes up to `NEAR_REACH`, from there on those to
+        whole cells."""
         reach = math.ceil(NEAR_REACH * self.factor)
         square = np.full(grid.shape, reach**2, dtype=np.float32)
         for index, size, planes in self.cells:
             far = reach if planes.any() else 0  # nothing is nearest to what lies wholly inside
             first = grid.first * self.factor
             kernels.stamp_cells(index, size, planes, first, self.factor, far, square)
-        return self._metres(square, grid)
+        found = self._metres(square, grid)
+        return np.where(square < reach**2, found, np.maximum(found, cells))
 
     def near(self, grid: Grid, rows: Int32[np.ndarray, "bx by bz"]) -> Float32[np.ndarray, "n 17 17 17"]:
         """The same at the nodes four times as close of blocks that have a row."""
@@ -178,6 +180,19 @@ class DistanceField:
             if outside.any():
                 out[outside] = np.minimum(out[outside], self.beyond.lower_bound(points[outside]))
         return out
+
+    def within(self, other: "DistanceField") -> "DistanceField":
+        """Return bounds for what is an obstacle of this field and of another one on its grid."""
+        near, rows = [self.near, other.near], self.rows.copy()
+        both = (rows >= 0) & (other.rows >= 0)
+        near[0] = self.near.copy()
+        near[0][rows[both]] = np.maximum(self.near[rows[both]], other.near[other.rows[both]])
+        alone = (rows < 0) & (other.rows >= 0)
+        rows[alone] = len(self.near) + other.rows[alone]
+        return replace(
+            self, distance=np.maximum(self.distance, other.distance), rows=rows,
+            near=np.concatenate(near), _tensors={},
+        )  # fmt: skip
 
     def source_at(self, points: Points) -> Int16[np.ndarray, " n"]:
         """Index into `sources` of the obstacle nearest to the grid node nearest to each point;

@@ -49,7 +49,8 @@ class Cells:
     label: UInt8[np.ndarray, " n"]
     # the same at each corner of that cell, 0 where it is not occupied
     around: UInt8[np.ndarray, "n 8"]
-    # (nx, ny, nz, c): the level set lies in n . (x - index) <= c, in the same units; 0 if unknown
+    # (nx, ny, nz, c): in the cell of twice the edge that it is a child of, with its lowest corner
+    # at x0, the level set lies in n . (x - x0) <= c, in the same units; 0 if unknown
     plane: Float32[np.ndarray, "n 4"]
 
     def select(self, chosen: Chosen) -> "Cells":
@@ -80,16 +81,9 @@ class LevelSet:
         """Return what distances near it are measured to."""
         parts = [(part.index, part.size, part.plane) for part in self.cells[:-1]]
         for last in self.cells[-1:]:
-            # The children of a cell have one normal: one plane holds for all of them.
             size = 2 * last.size
-            parent = last.index // size
-            parent, first, where = _distinct(parent)
-            plane = last.plane[first]
-            offset = last.plane[:, 3] + (last.plane[:, :3] * (last.index % size)).sum(axis=1)
-            plane[:, 3] = -np.inf
-            np.maximum.at(plane[:, 3], where, offset.astype(np.float32))
-            plane[np.abs(plane[:, :3]).max(axis=1) == 0.0] = 0.0
-            parts.append((parent * size, size, plane))
+            parents, first, _ = _distinct(last.index // size)
+            parts.append((parents * size, size, last.plane[first]))
         return Planed(tuple(parts), factor)
 
     def box(self) -> tuple[Index, Index] | None:
@@ -341,7 +335,7 @@ def _border(
         label, around = _ownership(values, most, owner, np.zeros(len(most)))
         normal = normals[rows]
         steep = np.linalg.norm(normal, axis=1)
-        farthest = (most + normal @ (size * _CHILDREN.T)).max(axis=1)
+        farthest = (most + normal @ (size * (child + _CHILDREN).T)).max(axis=1)
         plane = np.column_stack([normal, farthest]) / np.maximum(steep, 1e-9)[:, None]
         plane[steep < 1e-3] = 0.0  # as good as constant
         whole = (least.min(axis=1) >= 0.0) & (around == around[:, :1]).all(axis=1)
@@ -349,7 +343,13 @@ def _border(
         cells = Cells(corner, size, label, around, plane.astype(np.float32))
         inside.append(cells.select(whole))
         kept.append(cells.select(~whole))
-    return _join(inside), _join(kept)
+    border = _join(kept)
+    # The children of a cell have one normal: one plane holds for all of them.
+    _, first, where = _distinct(border.index // (2 * size))
+    farthest = np.full(len(first), -np.inf, dtype=np.float32)
+    np.maximum.at(farthest, where, border.plane[:, 3])
+    border.plane[:, 3] = farthest[where]
+    return _join(inside), border
 
 
 def _join(parts: list[Cells]) -> Cells:

@@ -264,7 +264,7 @@ class World:
             return combine([], self.grid)
         distance, label = distance_to_lattice(lattice, self.grid)
         planed = cells.planed(self._factor)
-        distance = np.maximum(distance, planed.nodes(self.grid))
+        distance = planed.nodes(self.grid, distance)
         return NodeDistances(distance, label.astype(np.int16) - np.int16(1), (planed,))
 
     def _known_distances(self, solids: list[Any]) -> list[NodeDistances]:
@@ -326,7 +326,10 @@ class World:
             if seen or gone:
                 marks = self._without(self._all_seen if seen else self._unseen, gone)
                 others = self._unseen_distances(marks)
-            self._cache[key] = self._field([*others, self._known], gone)
+            field = self._field([*others, self._known], gone)
+            # Cells of what was seen reach out of the level set: no more of them is an obstacle than
+            # of it, or a higher bound on risk would refuse what a lower one does not.
+            self._cache[key] = field.within(self.fields_without(gone)) if seen else field
         return self._cache[key]
 
     @cached_property
