@@ -9,17 +9,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-ORDER = (
-    "answer",
-    "checking",
-    "ompl_callbacks",
-    "bake",
-    "predict",
-    "fit",
-    "risk",
-    "mesh_checker",
-    "distances",
-)
+ORDER = ("answer", "checking", "ompl_callbacks", "bake", "predict", "fit", "risk", "mesh_checker")
 
 
 def main() -> None:

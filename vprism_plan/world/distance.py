@@ -60,7 +60,9 @@ class Planed:
         found = self._metres(square, grid)
         return np.where(square < reach**2, found, np.maximum(found, cells))
 
-    def near(self, grid: Grid, rows: Int32[np.ndarray, "bx by bz"]) -> Float32[np.ndarray, "n 17 17 17"]:
+    def near(
+        self, grid: Grid, rows: Int32[np.ndarray, "bx by bz"]
+    ) -> Float32[np.ndarray, "n 17 17 17"]:
         """The same at the nodes four times as close of blocks that have a row."""
         reach, step = math.ceil(NEAR_REACH * self.factor), self.factor // _NEAR
         square = np.full((rows.max() + 1, *3 * (_SIDE + 1,)), reach**2, dtype=np.float32)

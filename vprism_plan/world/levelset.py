@@ -7,7 +7,8 @@ of edge h the log-odds g differ from the trilinear interpolation of their corner
 h^2/8 max|g_aa|; the second derivatives come from the 27 points that dividing the parent evaluates
 anyway. They are finite differences of a smooth function, counted twice: not a proof for an
 arbitrary one. A guess of the map's prior is not smooth: in a cell it counts as its largest, or
-least, value there, until cells resolve it.
+least, value there, until cells resolve it; then its voxels say how far it lies over a plane. The
+smallest cells have planes as well, which the level set does not cross in them.
 """
 
 import math
@@ -32,7 +33,7 @@ _SLACK = 1e-3
 _CHUNK = 1 << 16
 # Cells of a surface, a kilobyte each: about 0.8 square metres at a resolution of 1 mm.
 _MOST_CELLS = 8_000_000
-_LAST = 1
+_LAST = 1  # edge of the smallest cells, lattice steps
 
 _OFFSETS = np.indices((3, 3, 3)).reshape(3, 27).T
 _CHILDREN = np.indices((2, 2, 2)).reshape(3, 8).T
@@ -102,9 +103,7 @@ def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Values:
     return np.log(np.clip(probabilities[:, 1:].sum(axis=1), 1e-18, None)) - np.log(empty)
 
 
-def _evaluate(
-    map_: Any, points: Points, level: float
-) -> tuple[Values, Float32[np.ndarray, "n c"]]:
+def _evaluate(map_: Any, points: Points, level: float) -> tuple[Values, Float32[np.ndarray, "n c"]]:
     """Log-odds less those of the level, and what share each object has in P(occupied), at
     points."""
     values = np.empty(len(points))
@@ -125,7 +124,9 @@ def _distinct(nodes: Int[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np
     them."""
     low = nodes.min(axis=0, initial=2**31)
     extent = nodes.max(axis=0, initial=-(2**31)) - low + 1
-    keys = np.ravel_multi_index(tuple((nodes - low).T), tuple(extent)) if len(nodes) else nodes[:, 0]
+    keys = nodes[:, 0]
+    if len(nodes):
+        keys = np.ravel_multi_index(tuple((nodes - low).T), tuple(extent))
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     return nodes[first], first, inverse
 
