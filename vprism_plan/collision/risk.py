@@ -20,6 +20,7 @@ from vprism_plan.collision.explain import nearest_source, unit_ball_points, volu
 from vprism_plan.collision.packing import (
     AT_MOST,
     Configuration,
+    PackedWorld,
     Rows,
     Waypoints,
     pack_robot,
@@ -59,8 +60,8 @@ class Certain:
         return [self._world.certain_field(ids) for ids in self.rules]
 
     @cached_property
-    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same for the kernels: distances, block bounds, floats."""
+    def packed(self) -> PackedWorld:
+        """The same for the kernels: distances, block bounds, near distances, floats."""
         return pack_world(self._world, self.fields, 0.0)
 
 
@@ -86,8 +87,8 @@ class Setting:
     margin: float = 0.0  # metres to keep from what is certain; in `radii` already
 
     @cached_property
-    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same for the kernels, with the margin: distances, block bounds, floats."""
+    def packed(self) -> PackedWorld:
+        """The same for the kernels, with the margin."""
         return wider(self.certain.packed, self.margin)
 
 
