@@ -245,7 +245,7 @@ def allowed_contacts(checker: Any, q: Configuration) -> list[Contact]:
         if robot.arrays.link_fixed[link]:
             continue
         for object_id in sorted(checker.allowed_objects(link)):
-            field = world.object_field(object_id)
+            field = world.source_field(f"object:{object_id}")
             gap = float(field.lower_bound(center[None])[0]) - radius
             if gap <= 0.0:
                 _, normal = nearest_source(world, field, center)
