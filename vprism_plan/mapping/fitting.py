@@ -111,12 +111,13 @@ def _fit(
     seed: int,
     prior: Any,
     known: Sequence[str] = (),
+    plane: Plane | None = None,
 ) -> VPrismMap:
-    """`fit_map`; `known` are warnings of an earlier map of some of the views."""
+    """`fit_map`; `known` are warnings that views gave already, which were examined with `plane`."""
     views = _views(observations)
     if views and not any(view.labels is None or (view.labels > 0).any() for view in views):
         return _of_empty_table(views, config, seed, known)
-    problem = learning_problem(views, config, seed)
+    problem = learning_problem(views, config, seed, plane)
     config, views, ids, plane, space = (
         problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
     )  # fmt: skip
@@ -202,16 +203,20 @@ class LearningProblem:
 
 
 def learning_problem(
-    observations: Observation | Sequence[Observation], config: MapConfig, seed: int
+    observations: Observation | Sequence[Observation],
+    config: MapConfig,
+    seed: int,
+    plane: Plane | None = None,
 ) -> LearningProblem:
     """Return the data and features of `fit_map`, for it and for what is compared with it.
 
-    Arguments and errors are those of `fit_map`.
+    Arguments and errors are those of `fit_map`; views that come with a `plane` have been examined.
     """
-    views = _views(observations)
-    views = _usable(views)
-    plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane)
+    views, warnings = _views(observations), ()
+    if plane is None:
+        views = _usable(views)
+        plane = _support_plane(views, _checked_seed(seed))
+        views, warnings = examine(views, plane)
     object_ids = _object_ids(views) or views[0].require_objects()
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
@@ -261,7 +266,10 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     if old.prior is not None or not seen or not set(seen) <= set(old.object_ids):
         logger.info("all %d views are fitted together", len(views))
         guessed = old.prior is not None or not old.object_ids
-        return _fit(views, config, old.seed, prior if guessed else None, old.warnings)
+        known = (*old.warnings, *found)
+        if observation.plane is not None and all(view.plane is None for view in old.views):
+            plane = None  # a given plane is better than the fitted one
+        return _fit(views, config, old.seed, prior if guessed else None, known, plane)
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
@@ -272,7 +280,7 @@ def update_map(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMa
     hinges = np.concatenate([old.space.hinges, added])
     if len(hinges) > config.max_hinges:
         logger.info("all %d views are fitted together, on a coarser lattice", len(views))
-        return _fit(views, config, old.seed, None, old.warnings)
+        return _fit(views, config, old.seed, None, (*old.warnings, *found), plane)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     fresh = weight_prior(space, config, old.n_classes)
@@ -296,7 +304,10 @@ def training_data(
     labels = np.concatenate([label for _, label in clouds]).astype(np.int64)
     lower, upper = box_centers(points, labels, object_ids, config.box_trim)
     centers = 0.5 * (lower + upper)
-    empty = [points[labels == 0]]
+    free = points[labels == 0]
+    if config.ray_sampling != "whole":  # samples of other rays are near as they are
+        free = _near_any(free, centers, config.object_radius)
+    empty = [free]
     front: list[np.ndarray] = []
     for view, (cloud, label) in zip(views, clouds, strict=True):
         origin = view.camera_center
@@ -317,10 +328,8 @@ def training_data(
     # What lies lower than the plane has a hidden side of its own: nobody denies that.
     room = config.object_radius
     empty.append(below[outside_boxes(below, lower[sunk], upper[sunk], room)])
-    near = np.concatenate(empty)
-    if config.ray_sampling != "whole":
-        near = _near_any(near, centers, config.object_radius)
-    free = np.concatenate([grid_subsample(near, config.empty_resolution), *front])
+    near = grid_subsample(np.concatenate(empty), config.empty_resolution)
+    free = np.concatenate([near, *front])
     surfaces = [grid_subsample(points[labels == i], config.object_resolution) for i in object_ids]
     counts = [len(s) for s in surfaces]
     room = max(config.max_points - sum(counts), 1)

@@ -8,6 +8,7 @@ shadows are never too small, whatever the cell's size.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -130,7 +131,7 @@ def make_view(
     valid = depth > 0
     reach = np.where(valid, depth + np.maximum(tolerance, 3.0 * depth_sigma(depth)), np.inf)
     if plane is not None:
-        points = observation.point_image()[valid]
+        points, _ = observation.points()
         sigma = height_sigma(points - observation.camera_center, depth[valid], plane.normal)
         # Four, not three: one pixel in 700 would leave a speck on every open table.
         threshold = np.maximum(THIN, 4.0 * sigma)
@@ -287,8 +288,10 @@ def beside(points: Points, dense: Chosen) -> Chosen:
     """Which points (m) are dense, or within half a block of one that is."""
     if dense.all() or not dense.any():
         return dense
-    gap, _ = cKDTree(points[dense]).query(points, distance_upper_bound=0.5 * BLOCK)
-    return np.asarray(np.isfinite(gap))
+    gap, _ = cKDTree(points[dense]).query(points[~dense], distance_upper_bound=0.5 * BLOCK)
+    found = dense.copy()
+    found[~dense] = np.isfinite(gap)
+    return found
 
 
 def _at_step(view: Observation) -> Bool[np.ndarray, "h w"]:
@@ -299,6 +302,7 @@ def _at_step(view: Observation) -> Bool[np.ndarray, "h w"]:
     return (near < depth - _STEP) & (far > depth + _STEP)
 
 
+@lru_cache(maxsize=8)  # a world asks twice, and the world of the next view again
 def clutter_pixels(
     view: Observation,
     plane: Plane | None,
@@ -337,6 +341,7 @@ def clutter_pixels(
             chosen[off] &= dense
     found = np.zeros(view.shape, dtype=bool)
     found[valid] = chosen
+    found.setflags(write=False)
     return found
 
 
@@ -352,7 +357,7 @@ def background_points(
     for view in views:
         chosen = clutter_pixels(view, plane, height, lone_share, bounded)
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-        kept.append(view.point_image()[chosen])
+        kept.append(view.points()[0][chosen[view.depth > 0]])
         widths.append(0.5 * np.asarray(view.depth, dtype=np.float64)[chosen] / focal)
     return np.concatenate(kept), np.concatenate(widths)
 
