@@ -2,8 +2,10 @@
 """From observations to a map: samples, hinge points, EM (the paper's figure 2)."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -12,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from vprism_plan._arguments import choice, is_whole
 from vprism_plan._shapes import Indices, Points
+from vprism_plan._threads import beside
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping.config import MapConfig
 from vprism_plan.mapping.em import (
@@ -117,12 +120,17 @@ def _fit(
     views = _views(observations)
     if views and not any(view.labels is None or (view.labels > 0).any() for view in views):
         return _of_empty_table(views, config, seed, known)
-    problem = learning_problem(views, config, seed, plane)
-    config, views, ids, plane, space = (
-        problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
-    )  # fmt: skip
-    data, field = problem.data, None
+    views, plane, said = _examined(views, seed) if plane is None else (views, plane, ())
+    ids = _object_ids(views) or views[0].require_objects()
+    ask: Callable[[], Any] = lambda: None  # noqa: E731
     if prior is not None and config.prior_hidden_variance is not None:
+        ask = partial(_guessing(prior), views, ids, plane)
+    # Nobody else's code is called in a thread that it does not know.
+    with beside(ask) if isinstance(prior, str) else nullcontext(ask) as answer:
+        problem = _problem(views, ids, plane, config, seed)
+        guess = answer()
+    config, space, data, field = problem.config, problem.space, problem.data, None
+    if guess is not None:
 
         def empty(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
             low, high = data.lower[data.sunk], data.upper[data.sunk]
@@ -131,7 +139,7 @@ def _fit(
             return under_table | seen_through(points, views)
 
         field = prior_field(
-            _guessing(prior)(views, ids, plane),
+            guess,
             object_crops(views, ids, plane),
             empty,
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
@@ -147,16 +155,14 @@ def _fit(
     posterior = _learn(space, data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
-        tuple(dict.fromkeys([*known, *problem.warnings])), field,
+        tuple(dict.fromkeys([*known, *said, *problem.warnings])), field,
     )  # fmt: skip
 
 
 def _of_empty_table(
     views: tuple[Observation, ...], config: MapConfig, seed: int, known: Sequence[str]
 ) -> VPrismMap:
-    views = _usable(views)
-    plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane)
+    views, plane, warnings = _examined(views, seed)
     said = (
         "no pixel has an object's label: the map has no objects, and what stands on the support "
         "surface is background, an obstacle; if objects are there, label them (segment_tabletop)"
@@ -203,26 +209,41 @@ class LearningProblem:
 
 
 def learning_problem(
-    observations: Observation | Sequence[Observation],
+    observations: Observation | Sequence[Observation], config: MapConfig, seed: int
+) -> LearningProblem:
+    """Return the data and features of `fit_map`, for what is compared with it.
+
+    Arguments and errors are those of `fit_map`.
+    """
+    views, plane, warnings = _examined(_views(observations), seed)
+    object_ids = _object_ids(views) or views[0].require_objects()
+    problem = _problem(views, object_ids, plane, config, seed)
+    return replace(problem, warnings=(*warnings, *problem.warnings))
+
+
+def _examined(
+    views: tuple[Observation, ...], seed: int
+) -> tuple[tuple[Observation, ...], Plane, tuple[str, ...]]:
+    """Return views fit for use, their support plane, and what is odd about them."""
+    views = _usable(views)
+    plane = _support_plane(views, _checked_seed(seed))
+    views, warnings = examine(views, plane)
+    return views, plane, warnings
+
+
+def _problem(
+    views: tuple[Observation, ...],
+    object_ids: tuple[int, ...],
+    plane: Plane,
     config: MapConfig,
     seed: int,
-    plane: Plane | None = None,
 ) -> LearningProblem:
-    """Return the data and features of `fit_map`, for it and for what is compared with it.
-
-    Arguments and errors are those of `fit_map`; views that come with a `plane` have been examined.
-    """
-    views, warnings = _views(observations), ()
-    if plane is None:
-        views = _usable(views)
-        plane = _support_plane(views, _checked_seed(seed))
-        views, warnings = examine(views, plane)
-    object_ids = _object_ids(views) or views[0].require_objects()
+    """Return the data and features of examined views; warnings only of what was made of them."""
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
     hinges, used, coarser = _hinges_within_budget(data, views, plane, config, rng)
     space = FeatureSpace(sorted_hinges(hinges), used.gamma, used.cutoff_radius)
-    warnings = (*warnings, *_without_return(views, object_ids), *coarser)
+    warnings = (*_without_return(views, object_ids), *coarser)
     return LearningProblem(used, views, object_ids, plane, data, space, warnings)
 
 
