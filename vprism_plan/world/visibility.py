@@ -27,6 +27,7 @@ from vprism_plan.mapping.training_data import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points, within_balls
 from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.distance import bounding
 from vprism_plan.world.grid import Balls, Chosen, Image, Mask, Points, Values, Vector, window
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
@@ -369,12 +370,16 @@ _LOCAL = 11  # pixels
 def without_fringe(found: Mask, others: Mask) -> Mask:
     """Leave out found pixels that reach no farther than `_FRAY` from others, where these are more
     in the `_LOCAL` pixels around: a fringe of theirs, and not a thing with specks."""
-    if not others.any():
+    if not found.any():
         return found
-    deep = found & (distance_transform_edt(~others) > _FRAY)
-    kept = binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=_FRAY)
-    more = uniform_filter(found.astype(np.float64) - others, _LOCAL, mode="constant") > 0.0
-    return found & (kept | more)
+    box = bounding(found, _LOCAL)
+    near, beside_it, left = found[box], others[box], found.copy()
+    if beside_it.any():
+        deep = near & (distance_transform_edt(~beside_it) > _FRAY)
+        kept = binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=_FRAY)
+        more = uniform_filter(near.astype(np.float64) - beside_it, _LOCAL, mode="constant") > 0.0
+        left[box] &= kept | more
+    return left
 
 
 def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
