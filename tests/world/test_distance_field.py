@@ -12,6 +12,7 @@ from vprism_plan.world.distance import (
     DistanceField,
     Lattice,
     NodeDistances,
+    bounds_on,
     checked_points,
     distance_to_lattice,
     finish,
@@ -93,6 +94,21 @@ def test_bound_never_exceeds_the_distance_and_is_close(seed):
     assert loss.size == 0 or loss.max() < 0.75
     # Within touching distance the cell's corners leave at most twice their distance.
     assert ((truth - np.maximum(bound, 0.0))[inside] <= 1.75 * field.spacing).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_on_another_grid_never_exceed_the_distance_and_are_close(seed):
+    field, corners, edge = _field(seed, density=[0.0, 0.001, 0.005, 0.02, 0.1, 0.4][seed])
+    rng = np.random.default_rng(seed)
+    grid = Grid(0.005, rng.integers(-30, 10, 3), tuple(rng.integers(2, 40, 3).tolist()))
+    found = bounds_on(field, grid)
+    points = grid.slab(0, grid.shape[0])
+    bound, truth = found.distance.reshape(-1), _to_cells(points, corners, edge)
+    assert (bound <= truth).all()
+    asked = np.maximum(field.lower_bound(points), 0.0)
+    # Three axes, each half way between nodes 4 apart: at most sqrt(3) 2 steps.
+    assert (asked - bound).max() < 3.5 * grid.spacing
+    assert (asked - bound)[asked > 0.1].max(initial=0.0) < 0.5 * grid.spacing
 
 
 @pytest.mark.parametrize("seed", range(3))
