@@ -22,6 +22,7 @@ from vprism_plan.mapping.prior import (
     PriorField,
     hidden_depth,
 )
+from vprism_plan.mapping.shape_network import CHANNELS, own_prior
 from vprism_plan.perception.plane import Plane
 from vprism_plan.simulation.camera import Camera
 from vprism_plan.simulation.scenes import Scene, render, upright
@@ -250,6 +251,17 @@ def test_an_unknown_object_keeps_the_flat_prior(scene):
     guess = MeshPrior({})([scene.observation], scene.observation.object_ids, TABLE)
     proba = guess(np.zeros((5, 3)))
     np.testing.assert_allclose(proba[:, 0], 1.0 - FLAT_OCCUPANCY)
+
+
+def test_what_the_network_says_of_a_crop_does_not_depend_on_its_company():
+    network = own_prior().network
+    rng = np.random.default_rng(0)
+    crops = torch.from_numpy(rng.normal(size=(3, CHANNELS, 32, 32, 32)).astype(np.float32))
+    crops = crops.contiguous(memory_format=torch.channels_last_3d)
+    with torch.inference_mode():
+        said = network(crops[:2])[0]
+        for company in ([2, 0], [0, 0]):
+            assert torch.equal(network(crops[company])[1], said)
 
 
 def specks(rng, classes):

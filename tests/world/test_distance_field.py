@@ -22,6 +22,7 @@ from vprism_plan.world.distance import (
     Lattice,
     NodeDistances,
     at_nodes,
+    bounds_on,
     checked_points,
     combine,
     distance_to_lattice,
@@ -186,6 +187,21 @@ def test_the_checker_and_the_field_say_the_same_near_surfaces():
         for point, expected in zip(points, bound, strict=True):
             asked = distance, blocks, near, floats, rule, *point, np.inf, True
             assert checking.field_bound(*asked) == pytest.approx(expected, abs=2e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_on_another_grid_never_exceed_the_distance_and_are_close(seed):
+    field, corners, edge = _field(seed, density=[0.0, 0.001, 0.005, 0.02, 0.1, 0.4][seed])
+    rng = np.random.default_rng(seed)
+    grid = Grid(0.005, rng.integers(-30, 10, 3), tuple(rng.integers(2, 40, 3).tolist()))
+    found = bounds_on(field, grid)
+    points = grid.slab(0, grid.shape[0])
+    bound, truth = found.distance.reshape(-1), _to_cells(points, corners, edge)
+    assert (bound <= truth).all()
+    asked = np.maximum(field.lower_bound(points), 0.0)
+    # Three axes, each half way between nodes 4 apart: at most sqrt(3) 2 steps.
+    assert (asked - bound).max() < 3.5 * grid.spacing
+    assert (asked - bound)[asked > 0.1].max(initial=0.0) < 0.5 * grid.spacing
 
 
 @pytest.mark.parametrize("seed", range(3))

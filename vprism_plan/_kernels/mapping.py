@@ -234,6 +234,38 @@ def ray_samples(points, origin, centers, radius, step, first, count, uniform):
 
 
 # ---------------------------------------------------------------- blocks of near points
+# numpy's sort, searchsorted and assignment of slices take three seconds to compile.
+@njit(cache=True, nogil=True, fastmath=False)
+def _sort(values, n):
+    """Sort the first n values in place (Shell's sort)."""
+    gap = 1
+    while gap < n // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, n):
+            value = values[i]
+            j = i
+            while j >= gap and values[j - gap] > value:
+                values[j] = values[j - gap]
+                j -= gap
+            values[j] = value
+        gap //= 3
+
+
+@njit(cache=True, nogil=True, fastmath=False)
+def _first_from(values, least):
+    """Index of the first of some sorted values that is not below the least."""
+    low = 0
+    high = len(values)
+    while low < high:
+        middle = (low + high) // 2
+        if values[middle] < least:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
 @njit(cache=True, nogil=True, fastmath=False)
 def morton_keys(points, lower, edge):
     """Interleaved bits of every point's cell: points with near keys are near each other."""
@@ -312,7 +344,7 @@ def _near_box(lower, upper, hinges, cell_start, cell_items, grid_lower, cell, sh
                 if square < reach:
                     out[n] = h
                     n += 1
-    out[:n].sort()
+    _sort(out, n)
     return n
 
 
@@ -407,7 +439,8 @@ def block_features(
         )
         phi = phi_out[near_start[b] : near_start[b] + n + 1]
         _fill_features(points, order, start, stop, hinges, near, n, gamma, reach, phi)
-        near_out[near_start[b] : near_start[b] + n + 1] = near[: n + 1]
+        for u in range(n + 1):
+            near_out[near_start[b] + u] = near[u]
 
 
 # ---------------------------------------------------------------- learning
@@ -427,8 +460,8 @@ def gram_rows(block_start, near_start, near, phi_all, weights, row_first, base, 
         size = block_start[b + 1] - start
         own = near[near_start[b] : near_start[b + 1]]
         phi = phi_all[near_start[b] : near_start[b + 1]]
-        first = np.searchsorted(own, lo)
-        last = np.searchsorted(own, hi)
+        first = _first_from(own, lo)
+        last = _first_from(own, hi)
         scaled[:, size:] = 0.0
         columns = own.ctypes.data
         values = phi.ctypes.data
@@ -440,7 +473,7 @@ def gram_rows(block_start, near_start, near, phi_all, weights, row_first, base, 
                 row = own[i + r]
                 entries[r] = base[row]
                 # Hinges before the envelope are too far apart for any point to see both.
-                own_first[r] = np.searchsorted(own, row_first[row])
+                own_first[r] = _first_from(own, row_first[row])
                 begin = max(begin, own_first[r])
                 for p in range(size):
                     scaled[r, p] = weights[start + p] * phi[i + r, p]
@@ -484,7 +517,7 @@ def _block_moments(own, phi, mean, cov, row_first, base, partial, m_out, v_out):
         for r in range(rows):
             row = own[i + r]
             entries[r] = base[row]
-            begin = min(begin, np.searchsorted(own, row_first[row]))
+            begin = min(begin, _first_from(own, row_first[row]))
         # Of a pair outside the envelope some other finite entry is read: no point sees both
         # hinges, so that it is multiplied by 0 here or below.
         if rows == 1:

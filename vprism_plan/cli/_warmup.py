@@ -44,38 +44,51 @@ def compile_checks_meanwhile() -> None:
 
 def _is_done(job: str) -> bool | None:
     """Whether the kernel that a job compiles last is cached; None where nothing can be kept."""
-    from vprism_plan._kernels import checking, risk
+    from vprism_plan._kernels import risk, world
     from vprism_plan._kernels.jit import is_cached
 
-    return is_cached({"maps": risk.touch_each, "checks": checking.pair_gaps}[job])
+    return is_cached({"maps": world.classify_points, "checks": risk.touch_one}[job])
 
 
 def _compile_maps() -> None:
-    """Compile what fits a map, bakes a world of it and draws worlds from it."""
+    """Compile what fits a map and bakes a world of it."""
     import vprism_plan as vp
-    from vprism_plan.world import PosteriorWorlds
 
-    fitted = vp.fit_map(vp.load_observation(data_path("demo_scene")))
-    world, point = vp.World(fitted), np.zeros((1, 3))
+    world = vp.World(vp.fit_map(vp.load_observation(data_path("demo_scene"))))
+    point = np.zeros((1, 3))
     world.field.lower_bound(point)
     world.status(point)
-    PosteriorWorlds(fitted, n_worlds=64).touched(point, np.array([0.02]))
 
 
 def _compile_checks() -> None:
-    """Compile what a collision checker does when it is made."""
-    from vprism_plan.collision import CollisionChecker
+    """Compile what a collision checker does when it is made, and what counts drawn worlds."""
+    from vprism_plan.collision import CheckerConfig, CollisionChecker
+    from vprism_plan.mapping import MapConfig, VPrismMap
+    from vprism_plan.mapping.em import Posterior, weight_prior
+    from vprism_plan.mapping.features import FeatureSpace
     from vprism_plan.robots import Robot
+    from vprism_plan.world import PosteriorWorlds, WorldConfig
 
+    points, settings = np.zeros((1, 3)), MapConfig()
+    space = FeatureSpace(points, settings.gamma, settings.cutoff_radius)
+    posterior = Posterior(weight_prior(space, settings, 2), ())
+    unfitted = VPrismMap(settings, (1,), None, (), space, posterior, 0)
     field = SimpleNamespace(
         origin=np.zeros(3), spacing=0.1, distance=np.ones((3, 3, 3), np.float32),
         source=np.zeros((3, 3, 3), np.int16),
     )  # fmt: skip
     world = SimpleNamespace(
-        field=field, planes=np.zeros((0, 4)), plane_names=(), sources=("nothing",), map=None,
-        config=SimpleNamespace(occluded="occupied", unobserved="free"),
+        field=field, planes=np.zeros((0, 4)), plane_names=(), sources=("nothing",), map=unfitted,
+        config=WorldConfig(), certain_field=lambda *_, **__: field,
+        posterior_worlds=lambda *asked: PosteriorWorlds(
+            unfitted, **dict(zip(("n_worlds", "seed", "reach", "resolution"), asked, strict=True))
+        ),
     )  # fmt: skip
-    CollisionChecker(world, Robot.from_urdf(urdf_path("panda")))
+    # The draws last: the other half has compiled by then what they share with maps.
+    checker = CollisionChecker(
+        world, Robot.from_urdf(urdf_path("panda")), CheckerConfig(max_risk=None)
+    )
+    checker.collision_probability(np.zeros(7))
 
 
 _JOBS = {"maps": _compile_maps, "checks": _compile_checks}

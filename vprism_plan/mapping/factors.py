@@ -23,7 +23,7 @@ from vprism_plan._threads import run_chunked
 from vprism_plan.errors import MapError
 from vprism_plan.mapping.features import FeatureSpace
 
-_BLOCK = 128  # hinges per block column: wide enough for fast products, narrow for the envelope
+_BLOCK = 96  # hinges per block column: wide enough for fast products, narrow for the envelope
 _NOT_POSITIVE = "a posterior precision is not positive definite; lower the prior variance"
 
 

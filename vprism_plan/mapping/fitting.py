@@ -2,8 +2,10 @@
 """From observations to a map: samples, hinge points, EM (the paper's figure 2)."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -12,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from vprism_plan._arguments import choice, is_whole, number
 from vprism_plan._shapes import Indices, Points
+from vprism_plan._threads import beside
 from vprism_plan.errors import MapError, ObservationError
 from vprism_plan.mapping.changes import Changes, notice, numbered, without_old
 from vprism_plan.mapping.config import MapConfig
@@ -52,6 +55,7 @@ from vprism_plan.perception.observation import Observation
 from vprism_plan.perception.plane import Plane
 from vprism_plan.perception.plane_fitting import fit_plane
 from vprism_plan.perception.sanity import examine
+from vprism_plan.perception.several_views import agree
 
 logger = logging.getLogger(__name__)
 
@@ -113,19 +117,27 @@ def _fit(
     seed: int,
     prior: Any,
     known: Sequence[str] = (),
+    plane: Plane | None = None,
     compared: bool = False,
 ) -> VPrismMap:
-    """`fit_map`; `known` are warnings of an earlier map of some of the views, which may have been
-    `compared` with one another already."""
+    """`fit_map`; `known` are warnings that views gave already, which were examined with `plane`,
+    or at least `compared` with one another."""
     views = _views(observations)
     if views and not any(view.labels is None or (view.labels > 0).any() for view in views):
         return _of_empty_table(views, config, seed, known, compared)
-    problem = learning_problem(views, config, seed, compared)
-    config, views, ids, plane, space = (
-        problem.config, problem.views, problem.object_ids, problem.plane, problem.space,
-    )  # fmt: skip
-    data, field = problem.data, None
+    said: tuple[str, ...] = ()
+    if plane is None:
+        views, plane, said = _examined(views, seed, compared)
+    ids = _object_ids(views) or views[0].require_objects()
+    ask: Callable[[], Any] = lambda: None  # noqa: E731
     if prior is not None and config.prior_hidden_variance is not None:
+        ask = partial(_guessing(prior), views, ids, plane)
+    # Nobody else's code is called in a thread that it does not know.
+    with beside(ask) if isinstance(prior, str) else nullcontext(ask) as answer:
+        problem = _problem(views, ids, plane, config, seed)
+        guess = answer()
+    config, space, data, field = problem.config, problem.space, problem.data, None
+    if guess is not None:
 
         def empty(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
             low, high = data.lower[data.sunk], data.upper[data.sunk]
@@ -134,7 +146,7 @@ def _fit(
             return under_table | seen_through(points, views)
 
         field = prior_field(
-            _guessing(prior)(views, ids, plane),
+            guess,
             object_crops(views, ids, plane),
             empty,
             FLAT_OCCUPANCY if config.prior_occupancy is None else config.prior_occupancy,
@@ -150,7 +162,7 @@ def _fit(
     posterior = _learn(space, data, weights, config, field)
     return VPrismMap(
         config, ids, plane, views, space, posterior, seed,
-        tuple(dict.fromkeys([*known, *problem.warnings])), field,
+        tuple(dict.fromkeys([*known, *said, *problem.warnings])), field,
     )  # fmt: skip
 
 
@@ -161,9 +173,7 @@ def _of_empty_table(
     known: Sequence[str],
     compared: bool,
 ) -> VPrismMap:
-    views = _usable(views)
-    plane = _support_plane(views, _checked_seed(seed))
-    views, warnings = examine(views, plane, compared=compared)
+    views, plane, warnings = _examined(views, seed, compared)
     said = (
         "no pixel has an object's label: the map has no objects, and what stands on the support "
         "surface is background, an obstacle; if objects are there, label them (segment_tabletop)"
@@ -210,25 +220,42 @@ class LearningProblem:
 
 
 def learning_problem(
-    observations: Observation | Sequence[Observation],
-    config: MapConfig,
-    seed: int,
-    compared: bool = False,
+    observations: Observation | Sequence[Observation], config: MapConfig, seed: int
 ) -> LearningProblem:
-    """Return the data and features of `fit_map`, for it and for what is compared with it.
+    """Return the data and features of `fit_map`, for what is compared with it.
 
-    Arguments and errors are those of `fit_map`; `compared` is that of `examine`.
+    Arguments and errors are those of `fit_map`.
     """
-    views = _views(observations)
+    views, plane, warnings = _examined(_views(observations), seed)
+    object_ids = _object_ids(views) or views[0].require_objects()
+    problem = _problem(views, object_ids, plane, config, seed)
+    return replace(problem, warnings=(*warnings, *problem.warnings))
+
+
+def _examined(
+    views: tuple[Observation, ...], seed: int, compared: bool = False
+) -> tuple[tuple[Observation, ...], Plane, tuple[str, ...]]:
+    """Return views fit for use, their support plane, and what is odd about them; `compared` is
+    that of `examine`."""
     views = _usable(views)
     plane = _support_plane(views, _checked_seed(seed))
     views, warnings = examine(views, plane, compared=compared)
-    object_ids = _object_ids(views) or views[0].require_objects()
+    return views, plane, warnings
+
+
+def _problem(
+    views: tuple[Observation, ...],
+    object_ids: tuple[int, ...],
+    plane: Plane,
+    config: MapConfig,
+    seed: int,
+) -> LearningProblem:
+    """Return the data and features of examined views; warnings only of what was made of them."""
     rng = np.random.default_rng(seed)
     data = training_data(views, object_ids, plane, config, rng)
     hinges, used, coarser = _hinges_within_budget(data, views, plane, config, rng)
     space = FeatureSpace(sorted_hinges(hinges), used.gamma, used.cutoff_radius)
-    warnings = (*warnings, *_without_return(views, object_ids), *coarser)
+    warnings = (*_without_return(views, object_ids), *coarser)
     return LearningProblem(used, views, object_ids, plane, data, space, warnings)
 
 
@@ -273,15 +300,16 @@ def update_map(
     if forget is not None:
         seconds = number("forget", forget, 0.0, unit="seconds", error=MapError)
         before = without_old(before, observation.time, seconds)
-    (mended,), _ = examine((observation,), old.plane)
+    (mended,), found = examine((observation,), old.plane, old.views, compared=True)
     noticed = notice(mended, before, old.plane, old.changes.retired)
+    view = numbered(mended, noticed.table, len(before))
     same = len(noticed.earlier) == len(old.views)
     if same and all(a is b for a, b in zip(noticed.earlier, old.views, strict=True)):
-        fitted = _updated(old, numbered(observation, noticed.table, len(before)), prior)
+        fitted = _updated(old, view, found, prior)
     else:
         # Every view says where the table is, also one that no longer shows it.
         views = tuple(replace(view, plane=old.plane) for view in noticed.earlier)
-        fitted = _refitted(old, (*views, numbered(mended, noticed.table, len(before))), prior)
+        fitted = _refitted(old, (*views, view), prior)
     labels = observation.labels, fitted.views[-1].labels
     changes = Changes.between(
         old.object_ids, old.changes.retired, fitted.object_ids, noticed.moved, *labels
@@ -293,17 +321,30 @@ def _refitted(old: VPrismMap, views: tuple[Observation, ...], prior: Any) -> VPr
     """Fit all views together, as the old map was."""
     logger.info("all %d views are fitted together", len(views))
     guessed = old.prior is not None or not old.object_ids
-    return _fit(views, old.config, old.seed, prior if guessed else None, old.warnings, True)
+    return _fit(
+        views, old.config, old.seed, prior if guessed else None, old.warnings, compared=True
+    )
 
 
-def _updated(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
-    """Fit one more view of the scene as it was."""
+def _updated(
+    old: VPrismMap, observation: Observation, found: Sequence[str], prior: Any
+) -> VPrismMap:
+    """Fit one more view of the scene as it was; it was examined, and `found` odd in these ways."""
     config, plane = old.config, old.plane
-    (observation,), found = examine((observation,), plane, old.views)
+    (observation,) = agree((observation,), old.views)
+    found = (*found, *observation.warnings)
     seen = _object_ids((observation,))
     views = (*old.views, observation)
     if old.prior is not None or not seen or not set(seen) <= set(old.object_ids):
-        return _refitted(old, views, prior)
+        logger.info("all %d views are fitted together", len(views))
+        guessed = old.prior is not None or not old.object_ids
+        known = (*old.warnings, *found)
+        given = observation.plane is not None and all(view.plane is None for view in old.views)
+        return _fit(
+            views, config, old.seed, prior if guessed else None, known,
+            None if given else plane,  # a given one is better than the fitted one
+            compared=True,
+        )  # fmt: skip
     found = (*found, *_without_return((observation,), old.object_ids))
     rng = np.random.default_rng((old.seed, len(views)))
     data = training_data((observation,), seen, plane, config, rng)
@@ -314,7 +355,7 @@ def _updated(old: VPrismMap, observation: Observation, prior: Any) -> VPrismMap:
     hinges = np.concatenate([old.space.hinges, added])
     if len(hinges) > config.max_hinges:
         logger.info("all %d views are fitted together, on a coarser lattice", len(views))
-        return _fit(views, config, old.seed, None, old.warnings, True)
+        return _fit(views, config, old.seed, None, (*old.warnings, *found), plane)
     space = FeatureSpace(sorted_hinges(hinges), config.gamma, config.cutoff_radius)
     class_of = np.array([0, *(old.object_ids.index(i) + 1 for i in seen)])
     fresh = weight_prior(space, config, old.n_classes)
@@ -338,7 +379,10 @@ def training_data(
     labels = np.concatenate([label for _, label, _ in clouds]).astype(np.int64)
     lower, upper = box_centers(points, labels, object_ids, config.box_trim)
     centers = 0.5 * (lower + upper)
-    empty = [points[labels == 0]]
+    free = points[labels == 0]
+    if config.ray_sampling != "whole":  # samples of other rays are near as they are
+        free = _near_any(free, centers, config.object_radius)
+    empty = [free]
     front: list[np.ndarray] = []
     for view, (cloud, label, ends) in zip(views, clouds, strict=True):
         origin = view.camera_center
@@ -360,10 +404,8 @@ def training_data(
     # What lies lower than the plane has a hidden side of its own: nobody denies that.
     room = config.object_radius
     empty.append(below[outside_boxes(below, lower[sunk], upper[sunk], room)])
-    near = np.concatenate(empty)
-    if config.ray_sampling != "whole":
-        near = _near_any(near, centers, config.object_radius)
-    free = np.concatenate([grid_subsample(near, config.empty_resolution), *front])
+    near = grid_subsample(np.concatenate(empty), config.empty_resolution)
+    free = np.concatenate([near, *front])
     surfaces = [grid_subsample(points[labels == i], config.object_resolution) for i in object_ids]
     counts = [len(s) for s in surfaces]
     room = max(config.max_points - sum(counts), 1)

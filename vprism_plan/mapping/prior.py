@@ -247,10 +247,12 @@ class PriorField:
 
     def covers(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         """Return which points (m) lie in the grid of an object, where it alone counts."""
-        last, inside = self.log_odds.shape[1] - 1, np.zeros(len(points), dtype=bool)
+        last, left = self.log_odds.shape[1] - 1, np.arange(len(points))
         for pose in self.T_voxel_world:
-            at = points @ pose[:, :3].T + pose[:, 3]
-            inside |= (np.minimum(at, last - at) >= FADE).all(axis=1)
+            at = points[left] @ pose[:, :3].T + pose[:, 3]
+            left = left[(np.minimum(at, last - at) < FADE).any(axis=1)]
+        inside = np.ones(len(points), dtype=bool)
+        inside[left] = False
         return inside
 
     def nearest(self, points: Points) -> tuple[Indices, Points]:

@@ -200,19 +200,23 @@ class ShapePrior:
         """Return what the network thinks of every object; the same views give the same bits."""
         crops = object_crops(views, object_ids, plane)
         clouds = [view.points() for view in views]
-        found = np.empty((len(crops), 2, SIDE, SIDE, SIDE))
+        # Always two at a time, the last one with itself: a batch's bits may depend on its size, and
+        # torch leaves batches of one, of so few channels, to convolutions of a quarter the speed.
+        pairs = -(-len(crops) // 2)
+        found = np.empty((2 * pairs, 2, SIDE, SIDE, SIDE))
 
-        def ask(k: int) -> None:
-            features = torch.from_numpy(crop_features(crops[k], views, object_ids[k], clouds))
-            x = features[None].to(self._device)
-            # Five times faster on a CPU than the default layout.
-            x = x.contiguous(memory_format=torch.channels_last_3d)
+        def ask(pair: int) -> None:
+            features = [
+                crop_features(crops[k], views, object_ids[k], clouds)
+                for k in (2 * pair, min(2 * pair + 1, len(crops) - 1))
+            ]
+            x = torch.from_numpy(np.stack(features)).to(self._device)
+            x = x.contiguous(memory_format=torch.channels_last_3d)  # faster on a CPU
             with torch.inference_mode():
-                found[k] = self.network(x)[0].double().cpu().numpy()
+                found[2 * pair : 2 * pair + 2] = self.network(x).double().cpu().numpy()
 
-        # One at a time in each thread: a batch's bits may depend on its size.
-        run_per_class(ask, len(crops))
-        return NetworkGuess(crops, found)
+        run_per_class(ask, pairs)
+        return NetworkGuess(crops, found[: len(crops)])
 
 
 @cache

@@ -132,11 +132,25 @@ def grid_subsample(points: Points, resolution: float | None) -> Points:
     index = (cells - lower).astype(np.int64)
     shape = extent.astype(np.int64)
     key = (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
-    order = np.argsort(key, kind="stable")
-    sorted_key = key[order]
-    start = np.flatnonzero(np.concatenate(([True], sorted_key[1:] != sorted_key[:-1])))
+    order, start = _grouped(key)
     count = np.diff(np.append(start, len(points)))
     return np.add.reduceat(points[order], start, axis=0) / count[:, None]
+
+
+def _grouped(keys: Indices) -> tuple[Indices, Indices]:
+    """Order whole numbers from 0, equal ones as they come; return also where each new one starts.
+
+    Sorting values that hold their own place is many times faster than numpy's stable argsort.
+    """
+    bits = len(keys).bit_length()
+    if int(keys.max(initial=0)).bit_length() + bits < 63:
+        both = keys << bits | np.arange(len(keys))
+        both.sort()
+        order, ordered = both & (1 << bits) - 1, both >> bits
+    else:
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+    return order, np.flatnonzero(np.diff(ordered, prepend=-1))
 
 
 _CELL = 0.01  # metres; a point's surroundings are its cell and the 26 around it
@@ -162,16 +176,19 @@ def stray_points(points: Float[np.ndarray, "n 3"], share: float) -> Bool[np.ndar
 
 def points_around(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Return how many of the points (m) lie in the `BLOCK` wide block around each."""
-    cells, inverse, counts = np.unique(
-        np.floor(points / _CELL).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    cells -= cells.min(axis=0, initial=0) - 1  # the neighbours of all have keys, in order
-    shape = cells.max(axis=0, initial=0) + 2
-    keys = np.ravel_multi_index(tuple(cells.T), tuple(shape))
-    totals = np.concatenate([[0], np.cumsum(counts)])
-    around = np.zeros(len(cells), dtype=np.int64)
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.int64)
+    cells = np.floor(points / _CELL).astype(np.int64)
+    cells -= cells.min(axis=0) - 1  # the neighbours of all have keys, in order
+    shape = cells.max(axis=0) + 2
+    every = np.ravel_multi_index(tuple(cells.T), tuple(shape))
+    order, start = _grouped(every)
+    keys, totals = every[order[start]], np.append(start, len(points))
+    around = np.zeros(len(keys), dtype=np.int64)
     for x, y in product((-1, 0, 1), repeat=2):  # three in a row follow one another
         low = keys + (x * shape[1] + y) * shape[2] - 1
         ends = [np.searchsorted(keys, key) for key in (low, low + 3)]
         around += totals[ends[1]] - totals[ends[0]]
-    return around[inverse.reshape(-1)]
+    found = np.empty(len(points), dtype=np.int64)
+    found[order] = np.repeat(around, np.diff(totals))
+    return found

@@ -2,7 +2,7 @@
 """One view of the scene: depth, labels and a known camera."""
 
 from dataclasses import InitVar, dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -212,12 +212,19 @@ class Observation:
         """World points (metres) of the pixels with a return, row by row, and their labels.
 
         Labels are all 0 if the observation is not segmented. Points of the robot are among them.
+        Both are read-only.
         """
-        valid = self.depth > 0
-        points = self.point_image()[valid]
-        if self.labels is None:
-            return points, np.zeros(len(points), dtype=np.int32)
-        return points, self.labels[valid]
+        return _points(self)
+
+
+@lru_cache(maxsize=2)  # a map and its world ask a dozen times; all views at once may not fit
+def _points(view: Observation) -> tuple[Points, Int32[np.ndarray, " n"]]:
+    valid = view.depth > 0
+    points = view.point_image()[valid]
+    labels = np.zeros(len(points), dtype=np.int32) if view.labels is None else view.labels[valid]
+    points.setflags(write=False)
+    labels.setflags(write=False)
+    return points, labels
 
 
 # ------------------------------------------------------------------------------------- checks

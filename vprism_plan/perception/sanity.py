@@ -125,12 +125,13 @@ def _lens(view: Observation) -> list[str]:
 
 def _bend(view: Observation, plane: Plane) -> list[str]:
     """Name depth that bends the table as lengths of rays do when they are taken for z."""
-    points = view.point_image()
+    valid = view.depth > 0
     band = 2.0 * inlier_band(view.depth, 0.01)
-    table = (view.depth > 0) & ~view.sees_robot
+    table = valid & ~view.sees_robot
     if view.labels is not None:
         table &= view.labels == 0
-    table[table] = np.abs(plane.signed_distance(points[table])) < band[table]
+    points = view.points()[0][table[valid]]
+    table[table] = np.abs(plane.signed_distance(points)) < band[table]
     index = np.flatnonzero(table)[:: max(1, int(table.sum()) // 5000)]
     if len(index) < 500:
         return []
@@ -169,8 +170,9 @@ def _sizes(view: Observation) -> list[str]:
 def _without_what_is_behind_the_surface(view: Observation, plane: Plane) -> Observation:
     """Take returns from below the seen surface for none: mirrors, refraction."""
     depth = view.depth.astype(np.float64)
-    points = view.point_image()
-    height = np.nan_to_num(plane.signed_distance(points), nan=np.inf)
+    (points, _), valid = view.points(), view.depth > 0
+    height = np.full(view.shape, np.inf)
+    height[valid] = plane.signed_distance(points)
     below = height < -np.maximum(_THROUGH, 3.0 * inlier_band(depth, 0.01))
     if view.labels is not None:
         below &= view.labels == 0
@@ -180,8 +182,8 @@ def _without_what_is_behind_the_surface(view: Observation, plane: Plane) -> Obse
     eye = view.camera_center
     above = float(plane.signed_distance(eye))
     share = above / (above - height[below])  # of the way to the return, to the surface
-    crossing = eye + share[:, None] * (points[below] - eye)
-    below[below] = _enclosed(plane, points[on], crossing)
+    crossing = eye + share[:, None] * (points[below[valid]] - eye)
+    below[below] = _enclosed(plane, points[on[valid]], crossing)
     if not below.any():
         return view
     text = (

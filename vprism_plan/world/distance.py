@@ -311,9 +311,28 @@ def at_nodes(grid: Grid, bound: Callable[[np.ndarray], np.ndarray]) -> Nodes:
     return distance
 
 
+_STRIDE = 4  # nodes
+
+
 def bounds_on(field: DistanceField, grid: Grid) -> NodeDistances:
-    """Lower bounds of a field's distances at the nodes of another grid, and their sources."""
-    distance = at_nodes(grid, field.lower_bound)
+    """Lower bounds of a field's distances at the nodes of another grid, and their sources.
+
+    The field is asked at every fourth node. In between holds, axis by axis, what
+    `DistanceField.lower_bound` says of the squared distance: half a millimetre less on average.
+    """
+    first = grid.first // _STRIDE
+    last = (grid.first + np.array(grid.shape) - 1) // _STRIDE + 1
+    wide = Grid(_STRIDE * grid.spacing, first, tuple((last - first + 1).tolist()))
+    square = at_nodes(wide, field.lower_bound).astype(np.float64) ** 2
+    for axis, start in enumerate(grid.first - _STRIDE * first):
+        ends = np.moveaxis(square, axis, 0)
+        steps = [
+            (1.0 - t) * ends[:-1] + t * ends[1:] - t * (1.0 - t) * wide.spacing**2
+            for t in np.arange(_STRIDE) / _STRIDE
+        ]
+        every = np.stack(steps, axis=1).reshape(-1, *ends.shape[1:])
+        square = np.moveaxis(every[start : start + grid.shape[axis]], 0, axis)
+    distance = round_down(np.sqrt(np.maximum(square, 0.0)) * (1.0 - 1e-12))
     ends = (np.stack([grid.origin, grid.upper]) - field.origin) / field.spacing
     nearest = [
         np.clip(np.rint(np.linspace(first, last, n)), 0, size - 1).astype(int)

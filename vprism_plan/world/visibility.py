@@ -8,6 +8,7 @@ shadows are never too small, whatever the cell's size.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -26,6 +27,7 @@ from vprism_plan.mapping.training_data import BLOCK, points_around
 from vprism_plan.perception import Observation, Plane
 from vprism_plan.perception.camera import depth_sigma, height_sigma, transform_points, within_balls
 from vprism_plan.world.config import WorldConfig
+from vprism_plan.world.distance import bounding
 from vprism_plan.world.grid import Balls, Chosen, Image, Mask, Points, Values, Vector, window
 
 # Metres: what was seen so near to the robot's balls may reach into them where nobody sees it.
@@ -130,7 +132,7 @@ def make_view(
     valid, free = depth > 0, np.asarray(observation.free_depth, dtype=np.float64)
     reach = np.where(free > 0, free + np.maximum(tolerance, 3.0 * depth_sigma(free)), np.inf)
     if plane is not None:
-        points = observation.point_image()[valid]
+        points, _ = observation.points()
         sigma = height_sigma(points - observation.camera_center, depth[valid], plane.normal)
         # Four, not three: one pixel in 700 would leave a speck on every open table.
         threshold = np.maximum(THIN, 4.0 * sigma)
@@ -287,8 +289,10 @@ def beside(points: Points, dense: Chosen) -> Chosen:
     """Which points (m) are dense, or within half a block of one that is."""
     if dense.all() or not dense.any():
         return dense
-    gap, _ = cKDTree(points[dense]).query(points, distance_upper_bound=0.5 * BLOCK)
-    return np.asarray(np.isfinite(gap))
+    gap, _ = cKDTree(points[dense]).query(points[~dense], distance_upper_bound=0.5 * BLOCK)
+    found = dense.copy()
+    found[~dense] = np.isfinite(gap)
+    return found
 
 
 def _at_step(view: Observation) -> Bool[np.ndarray, "h w"]:
@@ -299,6 +303,7 @@ def _at_step(view: Observation) -> Bool[np.ndarray, "h w"]:
     return (near < depth - _STEP) & (far > depth + _STEP)
 
 
+@lru_cache(maxsize=8)  # a world asks twice, and the world of the next view again
 def clutter_pixels(
     view: Observation,
     plane: Plane | None,
@@ -337,6 +342,7 @@ def clutter_pixels(
             chosen[off] &= dense
     found = np.zeros(view.shape, dtype=bool)
     found[valid] = chosen
+    found.setflags(write=False)
     return found
 
 
@@ -352,7 +358,7 @@ def background_points(
     for view in views:
         chosen = clutter_pixels(view, plane, height, lone_share, bounded)
         focal = min(float(view.intrinsics[0, 0]), float(view.intrinsics[1, 1]))
-        kept.append(view.point_image()[chosen])
+        kept.append(view.points()[0][chosen[view.depth > 0]])
         widths.append(0.5 * np.asarray(view.depth, dtype=np.float64)[chosen] / focal)
     return np.concatenate(kept), np.concatenate(widths)
 
@@ -364,12 +370,16 @@ _LOCAL = 11  # pixels
 def without_fringe(found: Mask, others: Mask) -> Mask:
     """Leave out found pixels that reach no farther than `_FRAY` from others, where these are more
     in the `_LOCAL` pixels around: a fringe of theirs, and not a thing with specks."""
-    if not others.any():
+    if not found.any():
         return found
-    deep = found & (distance_transform_edt(~others) > _FRAY)
-    kept = binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=_FRAY)
-    more = uniform_filter(found.astype(np.float64) - others, _LOCAL, mode="constant") > 0.0
-    return found & (kept | more)
+    box = bounding(found, _LOCAL)
+    near, beside_it, left = found[box], others[box], found.copy()
+    if beside_it.any():
+        deep = near & (distance_transform_edt(~beside_it) > _FRAY)
+        kept = binary_dilation(deep, np.ones((3, 3), dtype=bool), iterations=_FRAY)
+        more = uniform_filter(near.astype(np.float64) - beside_it, _LOCAL, mode="constant") > 0.0
+        left[box] &= kept | more
+    return left
 
 
 def clutter_depth(view: Observation, plane: Plane | None, config: WorldConfig) -> Image:
