@@ -208,17 +208,19 @@ def _stamp(corner, size, plane, first, step, reach, along, out):
 
 
 @njit(cache=True, nogil=True)
-def stamp_cells(index, size, planes, first, step, reach, out):
-    """`_stamp` of cells up to `reach` away."""
+def stamp_cells(index, size, planes, first, step, reach, out, start, stop):
+    """`_stamp` of cells up to `reach` away, onto nodes start to stop of the first axis."""
     along = np.empty((2, out.shape[2]), np.float32)
+    at = first.copy()
+    at[0] += step * start
     for n in range(len(index)):
-        _stamp(index[n], size, planes[n], first, step, reach, along, out)
+        _stamp(index[n], size, planes[n], at, step, reach, along, out[start:stop])
 
 
 @njit(cache=True, nogil=True)
-def stamp_blocks(index, size, planes, first, step, reach, rows, out):
+def stamp_blocks(index, size, planes, first, step, reach, rows, out, start, stop):
     """The same for blocks of which each has a row (-1 for none): out (row, n, n, n), where the last
-    nodes of a block are the first of the next one."""
+    nodes of a block are the first of the next one; for blocks start to stop of the first axis."""
     side = step * (out.shape[1] - 1)
     at, lo, hi = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     along = np.empty((2, out.shape[3]), np.float32)
@@ -226,7 +228,7 @@ def stamp_blocks(index, size, planes, first, step, reach, rows, out):
         for a in range(3):
             lo[a] = max((index[n, a] - reach - first[a] - 1) // side, 0)
             hi[a] = min((index[n, a] + size + reach - first[a]) // side + 1, rows.shape[a])
-        for i in range(lo[0], hi[0]):
+        for i in range(max(lo[0], start), min(hi[0], stop)):
             for j in range(lo[1], hi[1]):
                 for k in range(lo[2], hi[2]):
                     if rows[i, j, k] >= 0:

@@ -51,12 +51,17 @@ class Planed:
     def nodes(self, grid: Grid, cells: Nodes) -> Nodes:
         """Distances (m, rounded down) of a grid's nodes up to `NEAR_REACH`, from there on those to
         whole cells."""
-        reach = math.ceil(NEAR_REACH * self.factor)
+        reach, first = math.ceil(NEAR_REACH * self.factor), grid.first * self.factor
         square = np.full(grid.shape, reach**2, dtype=np.float32)
-        for index, size, planes in self.cells:
-            far = reach if planes.any() else 0  # nothing is nearest to what lies wholly inside
-            first = grid.first * self.factor
-            kernels.stamp_cells(index, size, planes, first, self.factor, far, square)
+
+        def stamp(s: slice) -> None:
+            for index, size, planes in self.cells:
+                far = reach if planes.any() else 0  # nothing is nearest to what lies wholly inside
+                kernels.stamp_cells(
+                    index, size, planes, first, self.factor, far, square, s.start, s.stop
+                )
+
+        run_chunked(stamp, len(square), 8)
         found = self._metres(square, grid)
         return np.where(square < reach**2, found, np.maximum(found, cells))
 
@@ -64,12 +69,18 @@ class Planed:
         self, grid: Grid, rows: Int32[np.ndarray, "bx by bz"]
     ) -> Float32[np.ndarray, "n 17 17 17"]:
         """The same at the nodes four times as close of blocks that have a row."""
-        reach, step = math.ceil(NEAR_REACH * self.factor), self.factor // _NEAR
+        reach, first = math.ceil(NEAR_REACH * self.factor), grid.first * self.factor
+        step = self.factor // _NEAR
         square = np.full((rows.max() + 1, *3 * (_SIDE + 1,)), reach**2, dtype=np.float32)
-        for index, size, planes in self.cells:
-            far = reach if planes.any() else 0
-            first = grid.first * self.factor
-            kernels.stamp_blocks(index, size, planes, first, step, far, rows, square)
+
+        def stamp(s: slice) -> None:
+            for index, size, planes in self.cells:
+                far = reach if planes.any() else 0
+                kernels.stamp_blocks(
+                    index, size, planes, first, step, far, rows, square, s.start, s.stop
+                )
+
+        run_chunked(stamp, len(rows), 1)
         return self._metres(square, grid)
 
     def _metres(self, square: Any, grid: Grid) -> Any:
