@@ -208,19 +208,17 @@ def _stamp(corner, size, plane, first, step, reach, along, out):
 
 
 @njit(cache=True, nogil=True)
-def stamp_cells(index, size, planes, first, step, reach, out, start, stop):
-    """`_stamp` of cells up to `reach` away, onto nodes start to stop of the first axis."""
+def stamp_cells(index, size, planes, first, step, reach, out):
+    """`_stamp` of cells up to `reach` away."""
     along = np.empty((2, out.shape[2]), np.float32)
-    at = first.copy()
-    at[0] += step * start
     for n in range(len(index)):
-        _stamp(index[n], size, planes[n], at, step, reach, along, out[start:stop])
+        _stamp(index[n], size, planes[n], first, step, reach, along, out)
 
 
 @njit(cache=True, nogil=True)
-def stamp_blocks(index, size, planes, first, step, reach, rows, out, start, stop):
+def stamp_blocks(index, size, planes, first, step, reach, rows, out):
     """The same for blocks of which each has a row (-1 for none): out (row, n, n, n), where the last
-    nodes of a block are the first of the next one; for blocks start to stop of the first axis."""
+    nodes of a block are the first of the next one."""
     side = step * (out.shape[1] - 1)
     at, lo, hi = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     along = np.empty((2, out.shape[3]), np.float32)
@@ -228,7 +226,7 @@ def stamp_blocks(index, size, planes, first, step, reach, rows, out, start, stop
         for a in range(3):
             lo[a] = max((index[n, a] - reach - first[a] - 1) // side, 0)
             hi[a] = min((index[n, a] + size + reach - first[a]) // side + 1, rows.shape[a])
-        for i in range(max(lo[0], start), min(hi[0], stop)):
+        for i in range(lo[0], hi[0]):
             for j in range(lo[1], hi[1]):
                 for k in range(lo[2], hi[2]):
                     if rows[i, j, k] >= 0:

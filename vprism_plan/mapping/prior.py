@@ -297,7 +297,7 @@ class PriorField:
             lambda s: kernels.guess_bounds(
                 centers, half, *self._grids, low, high, s.start, s.stop
             ),
-            len(centers), 2048,
+            len(centers), 512,
         )  # fmt: skip
         return low, high
 
@@ -316,7 +316,7 @@ class PriorField:
             lambda s: kernels.guess_bulges(
                 centers, half, *self._grids, shares, need, out, s.start, s.stop
             ),
-            len(centers), 2048,
+            len(centers), 512,
         )  # fmt: skip
         return out
 

@@ -51,17 +51,12 @@ class Planed:
     def nodes(self, grid: Grid, cells: Nodes) -> Nodes:
         """Distances (m, rounded down) of a grid's nodes up to `NEAR_REACH`, from there on those to
         whole cells."""
-        reach, first = math.ceil(NEAR_REACH * self.factor), grid.first * self.factor
+        reach = math.ceil(NEAR_REACH * self.factor)
         square = np.full(grid.shape, reach**2, dtype=np.float32)
-
-        def stamp(s: slice) -> None:
-            for index, size, planes in self.cells:
-                far = reach if planes.any() else 0  # nothing is nearest to what lies wholly inside
-                kernels.stamp_cells(
-                    index, size, planes, first, self.factor, far, square, s.start, s.stop
-                )
-
-        run_chunked(stamp, len(square), 8)
+        for index, size, planes in self.cells:
+            far = reach if planes.any() else 0  # nothing is nearest to what lies wholly inside
+            first = grid.first * self.factor
+            kernels.stamp_cells(index, size, planes, first, self.factor, far, square)
         found = self._metres(square, grid)
         return np.where(square < reach**2, found, np.maximum(found, cells))
 
@@ -69,18 +64,12 @@ class Planed:
         self, grid: Grid, rows: Int32[np.ndarray, "bx by bz"]
     ) -> Float32[np.ndarray, "n 17 17 17"]:
         """The same at the nodes four times as close of blocks that have a row."""
-        reach, first = math.ceil(NEAR_REACH * self.factor), grid.first * self.factor
-        step = self.factor // _NEAR
+        reach, step = math.ceil(NEAR_REACH * self.factor), self.factor // _NEAR
         square = np.full((rows.max() + 1, *3 * (_SIDE + 1,)), reach**2, dtype=np.float32)
-
-        def stamp(s: slice) -> None:
-            for index, size, planes in self.cells:
-                far = reach if planes.any() else 0
-                kernels.stamp_blocks(
-                    index, size, planes, first, step, far, rows, square, s.start, s.stop
-                )
-
-        run_chunked(stamp, len(rows), 1)
+        for index, size, planes in self.cells:
+            far = reach if planes.any() else 0
+            first = grid.first * self.factor
+            kernels.stamp_blocks(index, size, planes, first, step, far, rows, square)
         return self._metres(square, grid)
 
     def _metres(self, square: Any, grid: Grid) -> Any:

@@ -33,9 +33,7 @@ _SLACK = 1e-3
 _CHUNK = 1 << 16
 # Cells of a surface, a kilobyte each: about 0.8 square metres at a resolution of 1 mm.
 _MOST_CELLS = 8_000_000
-# Edge, lattice steps, of cells that have planes; of those in which nothing but what log-odds may
-# exceed those at the corners by reaches the level: divided once more, or they would be lumps.
-_PLANED, _LAST = 2, 1
+_LAST = 1  # edge of the smallest cells, lattice steps
 
 _OFFSETS = np.indices((3, 3, 3)).reshape(3, 27).T
 _CHILDREN = np.indices((2, 2, 2)).reshape(3, 8).T
@@ -52,8 +50,8 @@ class Cells:
     label: UInt8[np.ndarray, " n"]
     # the same at each corner of that cell, 0 where it is not occupied
     around: UInt8[np.ndarray, "n 8"]
-    # (nx, ny, nz, c): in the cell, with its lowest corner at x0, the level set lies in
-    # n . (x - x0) <= c, in the same units; 0 if unknown
+    # (nx, ny, nz, c): in the cell of twice the edge that it is a child of, with its lowest corner
+    # at x0, the level set lies in n . (x - x0) <= c, in the same units; 0 if unknown
     plane: Float32[np.ndarray, "n 4"]
 
     def select(self, chosen: Chosen) -> "Cells":
@@ -68,7 +66,8 @@ class LevelSet:
     """A cover of the level set, on a lattice whose node (0, 0, 0) is the world origin."""
 
     spacing: float  # of the lattice, metres
-    # those that lie wholly inside, by size; then those in which the level may be reached
+    # those that lie wholly inside, by size, and last those of one lattice step in which the level
+    # may be reached
     cells: tuple[Cells, ...]
     evaluations: int  # how many points of the map were evaluated
 
@@ -81,7 +80,11 @@ class LevelSet:
 
     def planed(self, factor: int) -> Planed:
         """Return what distances near it are measured to."""
-        parts = ((part.index, part.size, part.plane) for part in self.cells)
+        parts = [(part.index, part.size, part.plane) for part in self.cells[:-1]]
+        for last in self.cells[-1:]:
+            size = 2 * last.size
+            parents, first, _ = _distinct(last.index // size)
+            parts.append((parents * size, size, last.plane[first]))
         return Planed(tuple(parts), factor)
 
     def box(self) -> tuple[Index, Index] | None:
@@ -175,7 +178,7 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     last = np.ceil(upper / (spacing * size)).astype(np.int64)
     axes = [np.arange(a, b) * size for a, b in zip(first, last, strict=True)]
     index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    found: list[Cells] = []
+    inner: list[Cells] = []
     evaluations = 0
     while True:
         # Once cells resolve a surface, halves of them are four times as many.
@@ -197,16 +200,14 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
         if prior is not None and size * spacing > _RESOLVED * detail:
             guess = prior.at(nodes * spacing)
         bounds = _Bounds(prior, spacing, g.reshape(-1, 27), where, guess, shares)
-        if size <= _PLANED:
-            inside, kept, doubtful = _border(index, size, g, owners, bounds, step)
-            found += [inside, kept, *([doubtful] if size == _LAST else [])]
-            index = doubtful.index if size > _LAST else doubtful.index[:0]
-        else:
-            inside, border = _divide(index, size, g, owners, bounds, step)
-            found.append(inside)
-            index = border.index
+        if size == _LAST:
+            smallest = _border(index, size, g, owners, bounds, step)
+            return LevelSet(spacing, (*inner, *smallest), evaluations)
+        inside, border = _divide(index, size, g, owners, bounds, step)
+        inner.append(inside)
+        index = border.index
         if len(index) == 0:
-            return LevelSet(spacing, tuple(found), evaluations)
+            return LevelSet(spacing, tuple(inner), evaluations)
 
 
 @dataclass(frozen=True)
@@ -315,13 +316,14 @@ def _border(
     owners: UInt8[np.ndarray, "n 3 3 3"],
     bounds: _Bounds,
     step: float,
-) -> tuple[Cells, Cells, Cells]:
-    """Sort the children (edge `size`) into those inside, those to keep, and those to keep of which
-    no corner reaches the level; each with a plane that the level set does not cross in it, by what
-    log-odds differ from linear at its corners."""
+) -> tuple[Cells, Cells]:
+    """Sort the children (edge `size`) into those inside and those to keep, each with a plane that
+    the level set does not cross in it: by what log-odds differ from linear at its corners."""
     slack = bounds.slack(step)
+    ends = ((g.take(2, axis) - g.take(0, axis)) / (2.0 * size) for axis in (1, 2, 3))
+    normals = np.stack([-part.mean(axis=(1, 2)) for part in ends], axis=1)
     rough = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, slack)[1]
-    inside, kept, doubtful = [], [], []
+    inside, kept = [], []
     for child in _CHILDREN:
         nodes = (child + _CHILDREN) @ [9, 3, 1]
         rows = np.flatnonzero(rough[:, nodes].max(axis=1) >= -slack)
@@ -333,20 +335,23 @@ def _border(
         rows, corner, least, most = rows[chosen], corner[chosen], least[chosen], most[chosen]
         values, owner = (part.reshape(-1, 27)[rows][:, nodes] for part in (g, owners))
         label, around = _ownership(values, most, owner, np.zeros(len(most)))
-        slopes = (values @ (1.0 - 2.0 * _CHILDREN[:, axis]) for axis in range(3))
-        normal = np.stack(list(slopes), axis=1) / (4.0 * size)
+        normal = normals[rows]
         steep = np.linalg.norm(normal, axis=1)
-        farthest = (most + normal @ (size * _CHILDREN.T)).max(axis=1)
+        farthest = (most + normal @ (size * (child + _CHILDREN).T)).max(axis=1)
         plane = np.column_stack([normal, farthest]) / np.maximum(steep, 1e-9)[:, None]
         plane[steep < 1e-3] = 0.0  # as good as constant
         whole = (least.min(axis=1) >= 0.0) & (around == around[:, :1]).all(axis=1)
         plane[whole] = 0.0
         cells = Cells(corner, size, label, around, plane.astype(np.float32))
-        reached = values.max(axis=1) >= 0.0
         inside.append(cells.select(whole))
-        kept.append(cells.select(~whole & reached))
-        doubtful.append(cells.select(~whole & ~reached))
-    return _join(inside), _join(kept), _join(doubtful)
+        kept.append(cells.select(~whole))
+    border = _join(kept)
+    # The children of a cell have one normal: one plane holds for all of them.
+    _, first, where = _distinct(border.index // (2 * size))
+    farthest = np.full(len(first), -np.inf, dtype=np.float32)
+    np.maximum.at(farthest, where, border.plane[:, 3])
+    border.plane[:, 3] = farthest[where]
+    return _join(inside), border
 
 
 def _join(parts: list[Cells]) -> Cells:
