@@ -1,7 +1,4 @@
 # SPDX-License-Identifier: BSD-3-Clause
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -9,22 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.world_oracles import brute_force_distance
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
-from vprism_plan._kernels import checking
-from vprism_plan.collision.packing import pack_world
 from vprism_plan.errors import WorldError
-from vprism_plan.world import Box, WorldConfig
 from vprism_plan.world.distance import (
-    NO_NEAR,
-    NO_ROWS,
     DistanceField,
     Lattice,
     NodeDistances,
-    at_nodes,
     bounds_on,
     checked_points,
-    combine,
     distance_to_lattice,
     finish,
     round_down,
@@ -105,88 +94,6 @@ def test_bound_never_exceeds_the_distance_and_is_close(seed):
     assert loss.size == 0 or loss.max() < 0.75
     # Within touching distance the cell's corners leave at most twice their distance.
     assert ((truth - np.maximum(bound, 0.0))[inside] <= 1.75 * field.spacing).all()
-
-
-def _marked(rng: np.random.Generator, factor: int, grid: Grid) -> tuple[Lattice, np.ndarray, float]:
-    """A bar, plate or block of cells in a grid or at its rim, their lower corners, and edge."""
-    edge = grid.spacing / factor
-    shape = np.array(grid.shape) * factor
-    cells = np.zeros(shape, dtype=bool)
-    low = rng.integers(0, shape)
-    high = low + 1 + rng.integers(0, 6, 3) * rng.integers(0, 2, 3) * factor
-    cells[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = True
-    nodes = np.zeros(shape + 1, dtype=np.uint8)
-    for corner in np.ndindex(2, 2, 2):
-        nodes[tuple(slice(c, c + n) for c, n in zip(corner, cells.shape, strict=True))] |= cells
-    first = grid.first * factor + rng.integers(-factor, factor, 3)
-    return Lattice(nodes, first, factor), edge * (np.argwhere(cells) + first), edge
-
-
-@settings(max_examples=60)
-@given(
-    st.integers(0, 2**31),
-    st.lists(st.sampled_from([1, 2, 4, 8]), max_size=3),
-    st.integers(0, 2),
-    st.booleans(),
-)
-def test_near_distances_never_exceed_the_distance_and_lose_a_quarter_of_a_step(
-    seed, factors, solids, faces
-):
-    rng = np.random.default_rng(seed)
-    grid = Grid(0.02, rng.integers(-5, 5, 3), tuple(int(n) for n in rng.integers(6, 15, 3)))
-    points = rng.uniform(grid.origin, grid.upper, (3000, 3))
-    truth, parts = np.full(len(points), np.inf), []
-    source = np.zeros(grid.shape, dtype=np.int16)
-    for factor in factors:
-        lattice, corners, edge = _marked(rng, factor, grid)
-        parts.append(NodeDistances(distance_to_lattice(lattice, grid)[0], source, (lattice,)))
-        truth = np.minimum(truth, _to_cells(points, corners, edge))
-    for i in range(solids):
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.random(random_state=seed + i).as_matrix()
-        pose[:3, 3] = rng.uniform(grid.origin, grid.upper)
-        box = Box("box", rng.uniform(0.003, 0.1, 3), pose)
-        nodes = at_nodes(grid, lambda x, box=box: box.signed_distance(x) - 1e-9)
-        parts.append(NodeDistances(nodes, source, (box,)))
-        truth = np.minimum(truth, box.signed_distance(points))
-    if faces:  # known at nodes alone
-        index = np.indices(grid.shape)
-        rim = [np.minimum(i, n - 1 - i) for i, n in zip(index, grid.shape, strict=True)]
-        away = round_down(grid.spacing * np.minimum.reduce(rim).astype(float))
-        parts.append(NodeDistances(away, source))
-        outward = np.minimum(points - grid.origin, grid.upper - points).min(axis=1)
-        truth = np.minimum(truth, outward)
-    field = finish(combine(parts, grid), grid, ("thing",), faces, near=True)
-    bound = field.lower_bound(points)
-    assert (bound[truth > 0] <= truth[truth > 0]).all()
-    assert (bound[truth <= 0] <= 0.0).all()
-    plain = replace(field, near=NO_NEAR, rows=NO_ROWS)
-    assert (bound >= plain.lower_bound(points)).all()
-    # Beside what is inside at every node nobody looks closer; faces are known at nodes alone.
-    open_ = (truth > 0) & (truth < 1.9 * grid.spacing) & (not faces)
-    cell = np.clip((points - grid.origin) // grid.spacing, 0, np.array(grid.shape) - 2) // 4
-    open_ &= field.rows[tuple(cell.astype(int).T)] >= 0
-    assert (truth - np.maximum(bound, 0.0))[open_].max(initial=0.0) <= 0.23 * grid.spacing
-
-
-def test_the_checker_and_the_field_say_the_same_near_surfaces():
-    rng = np.random.default_rng(5)
-    grid = Grid(0.02, np.array([-2, 3, 0]), (15, 13, 17))
-    fields = []
-    for factor in (2, 4):
-        lattice, _, _ = _marked(rng, factor, grid)
-        source = np.zeros(grid.shape, dtype=np.int16)
-        part = NodeDistances(distance_to_lattice(lattice, grid)[0], source, (lattice,))
-        fields.append(finish(combine([part], grid), grid, ("thing",), False, near=True))
-    world = SimpleNamespace(planes=np.empty((0, 4)), config=WorldConfig())
-    distance, blocks, near, floats = pack_world(world, fields, 0.0)
-    points = rng.uniform(grid.origin - 0.02, grid.upper + 0.02, (2000, 3))
-    for rule, field in enumerate(fields):
-        assert len(field.near) > 0
-        bound = field.lower_bound(points)
-        for point, expected in zip(points, bound, strict=True):
-            asked = distance, blocks, near, floats, rule, *point, np.inf, True
-            assert checking.field_bound(*asked) == pytest.approx(expected, abs=2e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -251,7 +251,7 @@ def test_too_large_a_grid_is_refused_before_the_level_set_is_traced(monkeypatch)
 
 def test_too_fine_a_level_set_is_refused_before_it_fills_the_memory():
     small = ((0.0, 0.0, 0.0), (0.01, 0.01, 0.01))
-    with pytest.raises(WorldError, match=r"cells of 5e-05 m"):
+    with pytest.raises(WorldError, match=r"cells of 0\.0001 m"):
         World(random_map(2), WorldConfig(resolution=1e-4, bounds=small))
 
 

@@ -11,10 +11,7 @@ world floats `wf` = origin x, y, z, spacing, outside_occupied, n_planes, margin,
     four numbers per plane (normal x, y, z, offset; obstacle where n.x < offset); then, where
     obstacles lie outside the grid, a coarse grid of those: origin, spacing, sizes, nodes.
 distance fields `D` (rules, nx, ny, nz) float32: lower bounds of the signed distance at nodes.
-block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 x 4 cells, per
-    rule; then, per rule again, the block's row of `F`, or -1.
-near distances `F` (rows, 17, 17, 17) uint8: lower bounds at nodes four times as close, in steps of
-    a hundredth of `spacing`, of blocks near a surface; 0 also inside.
+block bounds `E` float32: one lower bound for everywhere in each block of 4 x 4 x 4 cells.
 """
 
 import numpy as np
@@ -31,8 +28,6 @@ _INF = np.inf
 # Radians or metres: what turns or slides farther is refused. Up to here angles are good to a
 # nanometre; at 1e16 radians nothing of them is left.
 FARTHEST = 1e6
-NEAR_STEPS = 100.0  # of a near distance, in one grid step
-NEAR_REACH = 2.55  # grid steps up to which there are near distances
 _MOST_CHECKS = 1_000_000  # configurations of one edge, seconds; an edge of so many is refused
 MAX_TURN = 0.5  # radians per step of a sampled path: keeps the bend between samples small
 
@@ -48,11 +43,10 @@ def _transform(T, f, rf, o, out, row):
 
 
 @njit(cache=True, nogil=True)
-def _cell_bound(D, rule, h, unit, least, cx, cy, cz):
+def _cell_bound(D, rule, h, cx, cy, cz):
     """Lower bound of the distance at grid point c from the eight nodes around it, metres.
 
-    D is in `unit`s of metres; of nodes at most `least` there is no cone. Two rules, both proofs
-    from distances d_i at the nodes x_i; the larger counts.
+    Two rules, both proofs from distances d_i at the nodes x_i; the larger counts.
 
     Cones: distance is 1-Lipschitz, so d(x) >= d_i - |x - x_i|.
 
@@ -75,29 +69,13 @@ def _cell_bound(D, rule, h, unit, least, cx, cy, cz):
             wb = wa * (fy if b else 1.0 - fy)
             eb = ea + (fy - b) ** 2
             for c in range(2):
-                d = unit * D[rule, i0 + a, j0 + b, k0 + c]
-                if d > least:
-                    cone = max(cone, d - h * np.sqrt(eb + (fz - c) ** 2))
+                d = D[rule, i0 + a, j0 + b, k0 + c]
+                cone = max(cone, d - h * np.sqrt(eb + (fz - c) ** 2))
                 d = min(max(d, 0.0), 1e9)  # no obstacle at all is an infinite distance
                 square += wb * (fz if c else 1.0 - fz) * d * d
     if square > 0.0:
         cone = max(cone, np.sqrt(square))
     return cone
-
-
-@njit(cache=True, nogil=True)
-def _near_bound(E, F, rule, h, cx, cy, cz):
-    """`_cell_bound` on the near nodes of the block of grid point c; -inf without any."""
-    i = int(cx) >> 2
-    j = int(cy) >> 2
-    k = int(cz) >> 2
-    row = int(E[E.shape[0] // 2 + rule, i, j, k])
-    if row < 0:
-        return -_INF
-    x = 4.0 * cx - 16.0 * i
-    y = 4.0 * cy - 16.0 * j
-    z = 4.0 * cz - 16.0 * k
-    return _cell_bound(F, row, 0.25 * h, h / NEAR_STEPS, 0.0, x, y, z)
 
 
 @njit(cache=True, nogil=True)
@@ -143,15 +121,14 @@ def _beyond_bound(wf, x, y, z):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def field_bound(D, E, F, wf, rule, x, y, z, enough, deep):
+def field_bound(D, E, wf, rule, x, y, z, enough, deep):
     """Lower bound of the distance from (x, y, z) to the baked obstacles, metres.
 
     Asked in this order until a bound exceeds `enough`; each is never below the one
     before, so verdicts do not depend on where it ends:
     the block (one number for 4 x 4 x 4 cells; a table that stays in the cache),
     the nearest node (its distance less the way to it),
-    and, if `deep`, the best of the cell's eight nodes (`_cell_bound`), of the grid and then, near
-    a surface, of those four times as close.
+    and, if `deep`, the best of the cell's eight nodes (`_cell_bound`).
 
     Outside the grid, with c the closest point of the grid box, every obstacle o of the
     grid satisfies |x - o|^2 >= |x - c|^2 + |c - o|^2, because the box is convex. What lies
@@ -181,9 +158,7 @@ def field_bound(D, E, F, wf, rule, x, y, z, enough, deep):
                 away = h * np.sqrt((cx - i) ** 2 + (cy - j) ** 2 + (cz - k) ** 2)
                 best = D[rule, i, j, k] - away
                 if deep and best <= enough:
-                    best = max(best, _cell_bound(D, rule, h, 1.0, -_INF, cx, cy, cz))
-                    if best <= enough and best < NEAR_REACH * h and F.shape[0] > 0:
-                        best = max(best, _near_bound(E, F, rule, h, cx, cy, cz))
+                    best = max(best, _cell_bound(D, rule, h, cx, cy, cz))
             if out2 > 0.0:
                 inside = max(best, 0.0)
                 best = np.sqrt(out2 * h * h + inside * inside)
@@ -221,7 +196,7 @@ def within_limits(q, rf, ri):
 
 
 @njit(cache=True, nogil=True)
-def _world_clear(T, lc, C, placed, rf, ri, D, E, F, wf):
+def _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
     """Whether every moving link keeps more than the margin from the world.
 
     Bounding spheres first; one loop without calls, since each call would pass (and
@@ -240,7 +215,7 @@ def _world_clear(T, lc, C, placed, rf, ri, D, E, F, wf):
         y = lc[link, 1]
         z = lc[link, 2]
         plane_ok = plane_bound(wf, x, y, z) > need
-        field_ok = field_bound(D, E, F, wf, rule, x, y, z, need, False) > need
+        field_ok = field_bound(D, E, wf, rule, x, y, z, need, False) > need
         if plane_ok and field_ok:
             continue
         if not placed[link]:
@@ -253,13 +228,13 @@ def _world_clear(T, lc, C, placed, rf, ri, D, E, F, wf):
             need = margin + rf[ro + s]
             if not plane_ok and not plane_bound(wf, x, y, z) > need:
                 return False
-            if not field_ok and not field_bound(D, E, F, wf, rule, x, y, z, need, True) > need:
+            if not field_ok and not field_bound(D, E, wf, rule, x, y, z, need, True) > need:
                 return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, F, wf, enough):
+def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, enough):
     """Lower bound of the distance from a link to the world, exact per sphere below `enough`.
 
     A sphere is never nearer than the link's bounding sphere, so each bound is the
@@ -271,7 +246,7 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, F, wf, enough):
     y = lc[link, 1]
     z = lc[link, 2]
     plane_all = plane_bound(wf, x, y, z) - r
-    field_all = field_bound(D, E, F, wf, rule, x, y, z, _INF, False) - r
+    field_all = field_bound(D, E, wf, rule, x, y, z, _INF, False) - r
     if min(plane_all, field_all) >= enough:
         return min(plane_all, field_all)
     if not placed[link]:
@@ -286,7 +261,7 @@ def _link_clearance(link, T, lc, C, placed, rf, ri, D, E, F, wf, enough):
         z = C[2, s]
         r = rf[ro + s]
         plane = max(plane_bound(wf, x, y, z) - r, plane_all)
-        field = max(field_bound(D, E, F, wf, rule, x, y, z, _INF, True) - r, field_all)
+        field = max(field_bound(D, E, wf, rule, x, y, z, _INF, True) - r, field_all)
         best = min(best, plane, field)
     return best
 
@@ -392,34 +367,34 @@ def pose_links(q, rf, ri, T, lc, placed):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _state_valid(q, rf, ri, D, E, F, wf, T, lc, C, placed):
+def _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed):
     if not within_limits(q, rf, ri):
         return False
     pose_links(q, rf, ri, T, lc, placed)
-    if not _world_clear(T, lc, C, placed, rf, ri, D, E, F, wf):
+    if not _world_clear(T, lc, C, placed, rf, ri, D, E, wf):
         return False
     return _self_clear(T, lc, C, placed, rf, ri)
 
 
 @njit(cache=True, nogil=True)
-def is_valid(q, rf, ri, D, E, F, wf):
+def is_valid(q, rf, ri, D, E, wf):
     """Whether a configuration is inside its limits and clear of the world and itself."""
     T, lc, C, placed = scratch(ri)
-    return _state_valid(q, rf, ri, D, E, F, wf, T, lc, C, placed)
+    return _state_valid(q, rf, ri, D, E, wf, T, lc, C, placed)
 
 
 @njit(cache=True, nogil=True)
-def is_valid_batch(Q, rf, ri, D, E, F, wf, out):
+def is_valid_batch(Q, rf, ri, D, E, wf, out):
     """Fill out (n,) with `is_valid` of each row of Q (n, dof).
 
     Calls it rather than inlining its body again, which would compile for seconds more.
     """
     for n in range(Q.shape[0]):
-        out[n] = is_valid(Q[n], rf, ri, D, E, F, wf)
+        out[n] = is_valid(Q[n], rf, ri, D, E, wf)
 
 
 @njit(cache=True, nogil=True)
-def clearance_batch(Q, rf, ri, D, E, F, wf, world, own):
+def clearance_batch(Q, rf, ri, D, E, wf, world, own):
     """Fill world (n,) and own (n,): distance bounds to the world and between links, metres."""
     T, lc, C, placed = scratch(ri)
     li = ri[9]
@@ -428,7 +403,7 @@ def clearance_batch(Q, rf, ri, D, E, F, wf, world, own):
         best = _INF
         for link in range(ri[2]):
             if ri[li + 4 * link + 3] >= 0:
-                best = min(best, _link_clearance(link, T, lc, C, placed, rf, ri, D, E, F, wf, best))
+                best = min(best, _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, best))
         world[n] = best
         gap = _INF
         for pair in range(ri[3]):
@@ -437,7 +412,7 @@ def clearance_batch(Q, rf, ri, D, E, F, wf, world, own):
 
 
 @njit(cache=True, nogil=True)
-def sphere_clearances(q, rf, ri, D, E, F, wf, C, plane, which, field):
+def sphere_clearances(q, rf, ri, D, E, wf, C, plane, which, field):
     """Per sphere: centre, distance to the nearest plane and its index, bound from the field.
 
     Every sphere's own values (no bounding spheres): what `explain` reports.
@@ -460,7 +435,7 @@ def sphere_clearances(q, rf, ri, D, E, F, wf, C, plane, which, field):
                 if d < plane[s]:
                     plane[s] = d
                     which[s] = p
-            field[s] = field_bound(D, E, F, wf, rule, x, y, z, _INF, True) - r
+            field[s] = field_bound(D, E, wf, rule, x, y, z, _INF, True) - r
 
 
 @njit(cache=True, nogil=True)
@@ -525,7 +500,7 @@ def motion_rates(delta, rf, ri, link_rate, pair_rate):
 
 
 @njit(cache=True, nogil=True)
-def _safe_span(q, rf, ri, D, E, F, wf, link_rate, pair_rate, longest, T, lc, C, placed):
+def _safe_span(q, rf, ri, D, E, wf, link_rate, pair_rate, longest, T, lc, C, placed):
     """How far along the edge (path parameter) a configuration's clearance reaches; < 0: invalid.
 
     Each link may move by its clearance, each pair by its gap, before anything can
@@ -541,8 +516,7 @@ def _safe_span(q, rf, ri, D, E, F, wf, link_rate, pair_rate, longest, T, lc, C, 
         if ri[li + 4 * link + 3] < 0:
             continue
         rate = link_rate[link]
-        room = margin + span * rate
-        c = _link_clearance(link, T, lc, C, placed, rf, ri, D, E, F, wf, room) - margin
+        c = _link_clearance(link, T, lc, C, placed, rf, ri, D, E, wf, margin + span * rate) - margin
         if not c > 0.0:
             return -1.0
         if c < span * rate:
@@ -559,7 +533,7 @@ def _safe_span(q, rf, ri, D, E, F, wf, link_rate, pair_rate, longest, T, lc, C, 
 
 
 @njit(cache=True, nogil=True)
-def check_motion(qa, qb, rf, ri, D, E, F, wf, min_motion, stats):
+def check_motion(qa, qb, rf, ri, D, E, wf, min_motion, stats):
     """Whether the straight edge qa -> qb is free, by conservative advancement.
 
     The edge is what the two ends say: a joint that differs by several turns makes them all.
@@ -591,12 +565,12 @@ def check_motion(qa, qb, rf, ri, D, E, F, wf, min_motion, stats):
     q = np.empty(dof)
     lo = np.empty(128)
     hi = np.empty(128)
-    span_a = _safe_span(qa, rf, ri, D, E, F, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
+    span_a = _safe_span(qa, rf, ri, D, E, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
     stats[1] = 1.0
     if span_a < 0.0:
         stats[0] = 0.0
         return False
-    span_b = _safe_span(qb, rf, ri, D, E, F, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
+    span_b = _safe_span(qb, rf, ri, D, E, wf, link_rate, pair_rate, 1.0, T, lc, C, placed)
     stats[1] = 2.0
     if span_b < 0.0:
         stats[0] = 1.0
@@ -619,7 +593,7 @@ def check_motion(qa, qb, rf, ri, D, E, F, wf, min_motion, stats):
             for j in range(dof):
                 q[j] = qa[j] + t * delta[j]
             span = _safe_span(
-                q, rf, ri, D, E, F, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, C, placed
+                q, rf, ri, D, E, wf, link_rate, pair_rate, 0.5 * (b - a), T, lc, C, placed
             )
             stats[1] += 1.0
         if span < 0.0:
@@ -635,14 +609,14 @@ def check_motion(qa, qb, rf, ri, D, E, F, wf, min_motion, stats):
 
 
 @njit(cache=True, nogil=True)
-def check_path(P, rf, ri, D, E, F, wf, min_motion, stats):
+def check_path(P, rf, ri, D, E, wf, min_motion, stats):
     """Index of the first edge of P (n, dof) that is in collision, or -1; see `check_motion`.
 
     stats (4,): of the refused edge. A single configuration counts as an edge to itself.
     """
     for e in range(max(P.shape[0] - 1, 1)):
         if not check_motion(
-            P[e], P[min(e + 1, P.shape[0] - 1)], rf, ri, D, E, F, wf, min_motion, stats
+            P[e], P[min(e + 1, P.shape[0] - 1)], rf, ri, D, E, wf, min_motion, stats
         ):
             return e
     return -1

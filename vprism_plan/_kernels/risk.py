@@ -30,7 +30,6 @@ NOTHING = np.uint8(255)
 DEEP = 16  # steps per voxel of the depth of an occupied one
 ODDS = 12.0  # steps of the log-odds per nat
 MOST_ODDS = 127
-NOT_JUDGED = np.uint8(255)
 BLOCK = 16  # edge of the blocks that are drawn and baked at once, voxels
 _STEP_RIM = np.float32(1e-3)  # of a step; what rounding may add to a whole number of them
 _FAR = np.uint16(40000)  # above any squared distance within reach, and twice that still fits
@@ -581,33 +580,3 @@ def causes(
                                 deepest[s] = depth
                                 sphere[s] = j
                                 owner[s] = owners[row, s]
-
-
-@njit(cache=True, nogil=True)
-def volume_codes(C, chosen, radii, tables, codes, origin, spacing, totals, missing):
-    """Add the balls' volume to totals (4,) by the code of the space it lies in; 3 is outside.
-
-    C (n, 3, m): only the samples `chosen` count. Seven points per ball. Returns how many of them
-    are NOT_JUDGED, and writes their nodes to missing; totals mean nothing then.
-    """
-    count = 0
-    nx, ny, nz = codes.shape
-    for i in chosen:
-        for j in range(C.shape[2]):
-            if tables[j] < 0:
-                continue
-            weight = radii[j] ** 3 / 7.0
-            for p in range(7):
-                offset = 0.0 if p == 0 else (0.6 if p % 2 else -0.6) * radii[j]
-                axis = (p - 1) // 2
-                x = int(np.floor((C[i, 0, j] + offset * (axis == 0) - origin[0]) / spacing + 0.5))
-                y = int(np.floor((C[i, 1, j] + offset * (axis == 1) - origin[1]) / spacing + 0.5))
-                z = int(np.floor((C[i, 2, j] + offset * (axis == 2) - origin[2]) / spacing + 0.5))
-                if not (0 <= x < nx and 0 <= y < ny and 0 <= z < nz):
-                    totals[3] += weight
-                elif codes[x, y, z] != NOT_JUDGED:
-                    totals[codes[x, y, z]] += weight
-                else:
-                    missing[count] = (x * ny + y) * nz + z
-                    count += 1
-    return count

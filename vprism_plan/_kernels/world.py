@@ -173,71 +173,6 @@ def fill_blocks(lattice, starts, labels, size):
 
 
 @njit(cache=True, nogil=True)
-def _stamp(corner, size, plane, first, step, reach, along, out):
-    """Lower out (nx, ny, nz) float32, at nodes first + step (i, j, k), to the squared distance from
-    what lies in a cell and under its plane, n . (x - corner) <= c; all in lattice steps. along
-    (2, nz) is room to work in."""
-    lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
-    for a in range(3):
-        lo[a] = max(-((first[a] + reach - corner[a]) // step), 0)
-        hi[a] = min((corner[a] + size + reach - first[a]) // step + 1, out.shape[a])
-    edge, zero = np.float32(size), np.float32(0.0)
-    most = np.float32(reach * reach)
-    n = max(hi[2] - lo[2], 0)
-    beside, under = along[0, :n], along[1, :n]
-    for k in range(n):
-        z = np.float32(first[2] + step * (lo[2] + k) - corner[2])
-        beside[k] = max(-z, z - edge, zero) ** 2
-        under[k] = plane[2] * z - plane[3]
-    for i in range(lo[0], hi[0]):
-        x = np.float32(first[0] + step * i - corner[0])
-        dx = max(-x, x - edge, zero) ** 2
-        for j in range(lo[1], hi[1]):
-            y = np.float32(first[1] + step * j - corner[1])
-            d = dx + max(-y, y - edge, zero) ** 2
-            if d <= most:
-                p = plane[0] * x + plane[1] * y
-                row = out[i, j, lo[2] : lo[2] + n]
-                for k in range(n):
-                    over = p + under[k]
-                    over = over if over > zero else zero
-                    far = d + beside[k]
-                    over *= over
-                    far = far if far > over else over
-                    row[k] = far if far < row[k] else row[k]
-
-
-@njit(cache=True, nogil=True)
-def stamp_cells(index, size, planes, first, step, reach, out):
-    """`_stamp` of cells up to `reach` away."""
-    along = np.empty((2, out.shape[2]), np.float32)
-    for n in range(len(index)):
-        _stamp(index[n], size, planes[n], first, step, reach, along, out)
-
-
-@njit(cache=True, nogil=True)
-def stamp_blocks(index, size, planes, first, step, reach, rows, out):
-    """The same for blocks of which each has a row (-1 for none): out (row, n, n, n), where the last
-    nodes of a block are the first of the next one."""
-    side = step * (out.shape[1] - 1)
-    at, lo, hi = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
-    along = np.empty((2, out.shape[3]), np.float32)
-    for n in range(len(index)):
-        for a in range(3):
-            lo[a] = max((index[n, a] - reach - first[a] - 1) // side, 0)
-            hi[a] = min((index[n, a] + size + reach - first[a]) // side + 1, rows.shape[a])
-        for i in range(lo[0], hi[0]):
-            for j in range(lo[1], hi[1]):
-                for k in range(lo[2], hi[2]):
-                    if rows[i, j, k] >= 0:
-                        at[0], at[1], at[2] = i, j, k
-                        for a in range(3):
-                            at[a] = first[a] + side * at[a]
-                        box = out[rows[i, j, k]]
-                        _stamp(index[n], size, planes[n], at, step, reach, along, box)
-
-
-@njit(cache=True, nogil=True)
 def mark_boxes(points, half, origin, spacing, label, lattice):
     """Mark the corners of every cell that the cube points[i] +- half[i] touches."""
     shape = lattice.shape
@@ -356,8 +291,11 @@ def guesses(points, poses, grids, node_pose, elsewhere, fade, empty, out, start,
 
 
 @njit(cache=True, nogil=True)
-def _inside(grid, pose, center, half):
-    """How far a cube reaches into a grid from its side, in steps: all of it, and any of it."""
+def _extremes(grid, pose, center, half, ends):
+    """Least and greatest of the nodes around a cube, ends (2,), and how far it reaches into the
+    grid from its side, in steps: all of it, and any of it."""
+    first = np.empty(3, np.int64)
+    final = np.empty(3, np.int64)
     whole, some = np.inf, np.inf
     for axis in range(3):
         last = grid.shape[axis] - 1.0
@@ -365,58 +303,15 @@ def _inside(grid, pose, center, half):
         reach = half * (abs(pose[axis, 0]) + abs(pose[axis, 1]) + abs(pose[axis, 2]))
         whole = min(whole, at - reach, last - at - reach)
         some = min(some, at + reach, last - at + reach)
-    return whole, some
-
-
-@njit(cache=True, nogil=True)
-def _extremes(grid, pose, center, half):
-    """Least and greatest of the nodes around a cube."""
-    first = np.empty(3, np.int64)
-    final = np.empty(3, np.int64)
-    for axis in range(3):
-        last = grid.shape[axis] - 1.0
-        at = _along(pose, axis, center)
-        reach = half * (abs(pose[axis, 0]) + abs(pose[axis, 1]) + abs(pose[axis, 2]))
         first[axis] = int(min(max(math.floor(at - reach), 0.0), last))
         final[axis] = int(min(max(math.ceil(at + reach), 0.0), last))
-    low, high = np.inf, -np.inf
+    ends[0], ends[1] = np.inf, -np.inf
     for i in range(first[0], final[0] + 1):
         for j in range(first[1], final[1] + 1):
             for k in range(first[2], final[2] + 1):
-                low, high = min(low, grid[i, j, k]), max(high, grid[i, j, k])
-    return low, high
-
-
-@njit(cache=True, nogil=True)
-def _around(center, half, poses, grids, node_pose, elsewhere, fade, empty, of, ends):
-    """Bounds of what `guesses` are made of in a cube, of each object c: of (C, 4) the least and
-    greatest of its own grid, if it reaches into that, and how far all of it and any of it do; ends
-    (2,) are those outside of own grids. Returns whether it reaches into any."""
-    deepest, nearest = -np.inf, -np.inf
-    for c in range(len(grids)):
-        of[c, 2], of[c, 3] = _inside(grids[c], poses[c], center, half)
-        if of[c, 3] > 0.0:
-            of[c, 0], of[c, 1] = _extremes(grids[c], poses[c], center, half)
-        deepest, nearest = max(deepest, of[c, 2]), max(nearest, of[c, 3])
-    low = high = 0.0
-    if deepest < fade:
-        low, high = _extremes(elsewhere, node_pose, center, half)
-        low, high = low - empty, high - empty
-    least = 1.0 - min(max(deepest / fade, 0.0), 1.0)
-    most = 1.0 - min(max(nearest / fade, 0.0), 1.0)
-    ends[0] = empty + min(least * low, most * low)
-    ends[1] = empty + max(least * high, most * high)
-    return nearest > 0.0
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _either(of, ends, fade):
-    """Bounds of an object's logit, from what `_around` says."""
-    if of[3] <= 0.0:
-        return ends[0], ends[1]
-    if of[2] >= fade:
-        return of[0], of[1]
-    return min(of[0], ends[0]), max(of[1], ends[1])
+                ends[0] = min(ends[0], grid[i, j, k])
+                ends[1] = max(ends[1], grid[i, j, k])
+    return whole, some
 
 
 @njit(cache=True, nogil=True)
@@ -424,124 +319,24 @@ def guess_bounds(
     centers, half, poses, grids, node_pose, elsewhere, fade, empty, low, high, start, stop
 ):  # fmt: skip
     """Bounds of the objects' logits of `guesses` in cubes: low and high (n, C)."""
-    ends, of = np.empty(2), np.empty((len(grids), 4))
-    for i in range(start, stop):
-        _around(centers[i], half, poses, grids, node_pose, elsewhere, fade, empty, of, ends)
-        for c in range(len(grids)):
-            low[i, c], high[i, c] = _either(of[c], ends, fade)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _shared(grid, p, fade, other):
-    """Value of a grid at an index p (3,), fading into another value at its sides if `fade` > 0."""
-    share = 1.0
-    for axis in range(3 if fade > 0.0 else 0):
-        share = min(share, p[axis] / fade, (grid.shape[axis] - 1.0 - p[axis]) / fade)
-    return other + max(share, 0.0) * (_trilinear(grid, p[0], p[1], p[2]) - other)
-
-
-@njit(cache=True, nogil=True)
-def _off_plane(grid, pose, center, half, fade, other):
-    """How far a grid that fades into another value may lie over what is linear between the corners
-    of a cube, but for products: of the box around the cube, between whose faces and the nodes'
-    planes grids are trilinear and, away from edges, shares linear."""
-    at, reach, slope, p = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    knots = np.empty((3, 2 * grid.shape[0] + 4))
-    count = np.empty(3, np.int64)
-    for axis in range(3):
-        at[axis] = _along(pose, axis, center)
-        reach[axis] = half * (abs(pose[axis, 0]) + abs(pose[axis, 1]) + abs(pose[axis, 2]))
-        knots[axis, 0] = at[axis] - reach[axis]
-        n = 1
-        for knot in range(math.ceil(knots[axis, 0]), math.ceil(at[axis] + reach[axis])):
-            knots[axis, n] = knot
-            n += 1
-        knots[axis, n] = at[axis] + reach[axis]
-        count[axis] = n + 1
-    for axis in range(3):
-        p[:] = at
-        p[axis] = at[axis] + reach[axis]
-        above = _shared(grid, p, fade, other)
-        p[axis] = at[axis] - reach[axis]
-        slope[axis] = (above - _shared(grid, p, fade, other)) / (2.0 * reach[axis])
-    least, most = np.inf, -np.inf
-    for i in range(count[0]):
-        p[0] = knots[0, i]
-        for j in range(count[1]):
-            p[1] = knots[1, j]
-            for k in range(count[2]):
-                p[2] = knots[2, k]
-                off = _shared(grid, p, fade, other)
-                off -= slope[0] * p[0] + slope[1] * p[1] + slope[2] * p[2]
-                least, most = min(least, off), max(most, off)
-    return most - least
-
-
-@njit(cache=True, nogil=True)
-def _beside_edge(grid, pose, center, half, fade):
-    """Whether a cube is where a grid fades towards two of its sides."""
-    sides = 0
-    for axis in range(3):
-        at, last = _along(pose, axis, center), grid.shape[axis] - 1.0
-        reach = half * (abs(pose[axis, 0]) + abs(pose[axis, 1]) + abs(pose[axis, 2]))
-        if min(at, last - at) - reach < fade:
-            sides += 1
-    return sides > 1
-
-
-@njit(cache=True, nogil=True)
-def guess_bulges(
-    centers, half, poses, grids, node_pose, elsewhere, fade, empty, shares, need, out, start, stop
-):  # fmt: skip
-    """How far log-odds in a cube may lie over, and under, what is linear between its corners, since
-    the logits of `guesses` do: out (n, 2), exact only where more than need (n,). The objects have
-    shares (n, C) in what is occupied, and log-odds are the logarithm of a sum over them."""
     C = len(grids)
-    ends, of = np.empty(2), np.empty((C, 4))
-    least, most = np.empty(C), np.empty(C)
-    nodes, at = np.empty((27, 3)), np.empty((27, 1 + C))
+    ends = np.empty(2)
+    whole, some = np.empty(C), np.empty(C)
     for i in range(start, stop):
-        inside = _around(
-            centers[i], half, poses, grids, node_pose, elsewhere, fade, empty, of, ends
-        )
-        total = 0.0
+        deepest, nearest = -np.inf, -np.inf
         for c in range(C):
-            least[c], most[c] = _either(of[c], ends, fade)
-            total += shares[i, c] * math.exp(most[c] - least[c])
-        out[i] = math.log(max(total, 1.0))
-        if out[i, 0] <= need[i]:
-            continue
-        known = False
-        outside = ends[1] - ends[0]
-        if outside > 0.0 and not inside:
-            outside = _off_plane(elsewhere, node_pose, centers[i], half, 0.0, 0.0)
-        up, down = 0.0, 0.0
+            whole[c], some[c] = _extremes(grids[c], poses[c], centers[i], half, ends)
+            low[i, c], high[i, c] = ends
+            deepest, nearest = max(deepest, whole[c]), max(nearest, some[c])
+        _extremes(elsewhere, node_pose, centers[i], half, ends)
+        other_low = empty if nearest > 0.0 else ends[0]
+        other_high = empty if deepest >= fade else ends[1]
         for c in range(C):
-            over = under = most[c] - least[c]
-            if shares[i, c] * (math.exp(over) - 1.0) > 0.01:
-                found = outside
-                if of[c, 3] > 0.0:
-                    other = 0.5 * (ends[0] + ends[1])
-                    found = _off_plane(grids[c], poses[c], centers[i], half, fade, other)
-                if of[c, 2] < fade:
-                    if not known:
-                        known = True
-                        for k in range(27):
-                            nodes[k, 0] = centers[i, 0] + half * (k // 9 - 1)
-                            nodes[k, 1] = centers[i, 1] + half * (k // 3 % 3 - 1)
-                            nodes[k, 2] = centers[i, 2] + half * (k % 3 - 1)
-                        guesses(nodes, poses, grids, node_pose, elsewhere, fade, empty, at, 0, 27)
-                    over, under = most[c] - at[:, 1 + c].min(), at[:, 1 + c].max() - least[c]
-                if of[c, 3] > 0.0 and of[c, 2] < fade:
-                    low, high = max(of[c, 2], 0.0) / fade, min(of[c, 3] / fade, 1.0)
-                    found += (1.0 - low) * (ends[1] - ends[0])
-                    found += 0.25 * (high - low) * (of[c, 1] - of[c, 0])
-                    if _beside_edge(grids[c], poses[c], centers[i], half, fade):
-                        found += (high - low) * max(of[c, 1] - ends[0], ends[1] - of[c, 0])
-                over, under = min(over, found), min(under, found)
-            up += shares[i, c] * math.exp(over)
-            down += shares[i, c] * math.exp(under)
-        out[i, 0], out[i, 1] = math.log(max(up, 1.0)), math.log(max(down, 1.0))
+            if some[c] <= 0.0:
+                low[i, c], high[i, c] = other_low, other_high
+            elif whole[c] < fade:
+                low[i, c] = min(low[i, c], other_low)
+                high[i, c] = max(high[i, c], other_high)
 
 
 @njit(cache=True, nogil=True)
@@ -711,10 +506,9 @@ def clear_below(normal, offset, origin, spacing, status, start, stop):
 
 
 @njit(cache=True, nogil=True)
-def _inside_bound(gx, gy, gz, spacing, distance, unit, least):
-    """Lower bound of the signed distance at a point g of the grid box, in its steps.
+def _inside_bound(px, py, pz, origin, spacing, distance):
+    """Lower bound of the signed distance at a point of the grid box.
 
-    Distances are in `unit`s of metres; the second rule goes by nodes farther than `least`.
     The squared distance to any set, less |x|^2, is a minimum of linear functions,
     hence concave; the trilinear weights write x as a mean of the cell's corners, so
     by Jensen d(x)^2 >= sum_i w_i d_i^2 - sum_i w_i |x_i - x|^2. Where that says
@@ -722,6 +516,9 @@ def _inside_bound(gx, gy, gz, spacing, distance, unit, least):
     most the way travelled: d(x) >= d_i - |x - x_i|.
     """
     nx, ny, nz = distance.shape
+    gx = (px - origin[0]) / spacing
+    gy = (py - origin[1]) / spacing
+    gz = (pz - origin[2]) / spacing
     i = min(max(math.floor(gx), 0), nx - 2)
     j = min(max(math.floor(gy), 0), ny - 2)
     k = min(max(math.floor(gz), 0), nz - 2)
@@ -732,7 +529,7 @@ def _inside_bound(gx, gy, gz, spacing, distance, unit, least):
         for b in range(2):
             wb = wa * (fy if b else 1.0 - fy)
             for c in range(2):
-                d = max(unit * distance[i + a, j + b, k + c], 0.0)
+                d = max(float(distance[i + a, j + b, k + c]), 0.0)
                 square += wb * (fz if c else 1.0 - fz) * d * d
     spread = fx * (1.0 - fx) + fy * (1.0 - fy) + fz * (1.0 - fz)
     square -= spread * spacing * spacing
@@ -744,23 +541,19 @@ def _inside_bound(gx, gy, gz, spacing, distance, unit, least):
             for c in range(2):
                 dc = fz - c
                 way = spacing * math.sqrt(da * da + db * db + dc * dc)
-                d = unit * distance[i + a, j + b, k + c]
-                if d > least:
-                    best = max(best, d - way)
+                best = max(best, float(distance[i + a, j + b, k + c]) - way)
     if square > 0.0:
         best = max(best, math.sqrt(square))
     return best
 
 
 @njit(cache=True, nogil=True)
-def lower_bounds(points, origin, spacing, distance, rows, near, unit, solid, out, start, stop):
+def lower_bounds(points, origin, spacing, distance, solid, out, start, stop):
     """Lower bound of the signed distance at points anywhere.
 
     Every obstacle o lies in the grid box. Outside of it, with c the nearest point of
     the box: |x - o|^2 >= |x - c|^2 + |c - o|^2, as for any convex set, hence
-    d(x) >= hypot(|x - c|, d(c)). `solid`: everything outside is an obstacle too. `near`: distances
-    at nodes four times as close, in `unit`s of metres, of blocks of 4 x 4 x 4 cells near a
-    surface, `rows` which; 0 also inside, so those say nothing of a depth.
+    d(x) >= hypot(|x - c|, d(c)). `solid`: everything outside is an obstacle too.
     """
     c = np.empty(3)
     for i in range(start, stop):
@@ -769,19 +562,10 @@ def lower_bounds(points, origin, spacing, distance, rows, near, unit, solid, out
             p = points[i, a]
             c[a] = min(max(p, origin[a]), origin[a] + spacing * (distance.shape[a] - 1))
             away += (p - c[a]) * (p - c[a])
-            c[a] = (c[a] - origin[a]) / spacing
         if away > 0.0 and solid:
             out[i] = -math.sqrt(away)
             continue
-        bound = _inside_bound(c[0], c[1], c[2], spacing, distance, 1.0, -np.inf)
-        if near.shape[0] > 0:
-            x, y, z = int(c[0]) >> 2, int(c[1]) >> 2, int(c[2]) >> 2
-            row = rows[x, y, z]
-            if row >= 0:
-                c *= 4.0
-                x, y, z = c[0] - 16 * x, c[1] - 16 * y, c[2] - 16 * z
-                fine = _inside_bound(x, y, z, 0.25 * spacing, near[row], unit, 0.0)
-                bound = max(bound, fine)
+        bound = _inside_bound(c[0], c[1], c[2], origin, spacing, distance)
         if away > 0.0:
             bound = math.sqrt(away + max(bound, 0.0) ** 2)
         # Rounding of the sums above stays far below a nanometre.

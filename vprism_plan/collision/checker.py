@@ -18,7 +18,6 @@ from vprism_plan.collision import entropy, explain, margins, motion
 from vprism_plan.collision.config import CheckerConfig, contact_rules
 from vprism_plan.collision.packing import (
     MARGIN,
-    NO_NEAR,
     Configuration,
     Numbers,
     PackedWorld,
@@ -68,7 +67,7 @@ class _AnyDraw:
             self._known = now, at, field, answer
         return answer
 
-    def _packed(self, tables: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _packed(self, tables: Any) -> tuple[np.ndarray, np.ndarray]:
         voxel, (scale, reach) = self._worlds.resolution, self._worlds.scale
         # Whoever asks where nothing is baked has to count: that bakes it.
         steps = np.append(np.maximum(tables.lowest.astype(np.float32) - DEEP, 0.0), -np.inf)
@@ -76,7 +75,7 @@ class _AnyDraw:
         drawn = steps[np.maximum(row, -1)] / np.float32(scale)
         bound = np.where(row == FREE, np.float32(reach), drawn) * np.float32(voxel * (1.0 - 1e-6))
         blocks = np.stack([block_bounds(one, voxel) for one in bound])
-        return np.ascontiguousarray(bound, dtype=np.float32), blocks, NO_NEAR
+        return np.ascontiguousarray(bound, dtype=np.float32), blocks
 
 
 class CollisionChecker(explain.Checker):

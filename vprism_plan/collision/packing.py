@@ -20,7 +20,6 @@ from vprism_plan.errors import RobotError
 from vprism_plan.robots.kinematics import KIND_PRISMATIC, KinematicArrays, Named, joint_values
 from vprism_plan.robots.pairs import pair_room
 from vprism_plan.robots.urdf import LIMIT_TOLERANCE
-from vprism_plan.world.distance import NO_NEAR, lowest_in_blocks
 from vprism_plan.world.grid import Vector
 
 # Arrays of joint values: of one configuration, of many, of a path.
@@ -36,9 +35,9 @@ Numbers = ArrayLike | Sequence[Any] | Named
 
 # Kernel view of a robot, floats and integers: `vprism_plan._kernels.checking` has the layout.
 PackedRobot = tuple[Float[np.ndarray, "f"], Int[np.ndarray, "i"]]
-# Kernel view of a world: distances at nodes and in blocks, near distances, and the grid, plane and
-# margin data; see there, too.
-PackedWorld = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+# Kernel view of a world: distances at nodes and in blocks (metres, float32), (rules, x, y, z)
+# each, and the grid, plane and margin data.
+PackedWorld = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _rotation_from_z(axis: Vector) -> Float[np.ndarray, "3 3"]:
@@ -171,8 +170,13 @@ def block_bounds(
 ) -> Float[np.ndarray, "bx by bz"]:
     """Return a lower bound of the distance (metres) for everywhere in each block of 4 x 4 x 4
     cells: every point is within half a cell's diagonal of a node, and distance is 1-Lipschitz."""
+    lowest = distance
+    for axis, n in enumerate(distance.shape):
+        blocks = (n - 1) // 4 + 1
+        rows = np.minimum(4 * np.arange(blocks)[:, None] + np.arange(5), n - 1)
+        lowest = np.take(lowest, rows, axis=axis).min(axis=axis + 1)
     # A little more than sqrt(3) / 2, so that rounding in float32 cannot lift a bound.
-    bounds = (lowest_in_blocks(distance) - np.float32(0.8662 * spacing)).astype(np.float32)
+    bounds = (lowest - np.float32(0.8662 * spacing)).astype(np.float32)
     return np.ascontiguousarray(np.nextafter(bounds, np.float32(-np.inf)))
 
 
@@ -191,20 +195,16 @@ def pack_world(world: Any, fields: Sequence[Any], margin: float) -> PackedWorld:
     head += [float(len(planes)), float(margin), *planes.reshape(-1)]
     floats = np.concatenate([head, far], dtype=np.float64)
     distance = np.ascontiguousarray([f.distance for f in fields], dtype=np.float32)
-    blocks, near = [block_bounds(d, float(field.spacing)) for d in distance], [NO_NEAR]
-    for f, bounds in zip(fields, list(blocks), strict=True):
-        rows, count = getattr(f, "rows", np.empty(0)), sum(map(len, near))
-        near.append(getattr(f, "near", NO_NEAR))
-        blocks.append(np.where(rows < 0, -1, rows + count) if rows.size else -np.ones_like(bounds))
-    return distance, np.ascontiguousarray(blocks, np.float32), np.concatenate(near), floats
+    blocks = np.ascontiguousarray([block_bounds(d, float(field.spacing)) for d in distance])
+    return distance, blocks, floats
 
 
 def wider(world: PackedWorld, extra: float) -> PackedWorld:
     """Return a packed world from which `extra` metres more are to be kept."""
-    distance, blocks, near, floats = world
+    distance, blocks, floats = world
     floats = floats.copy()
     floats[MARGIN] += extra
-    return distance, blocks, near, floats
+    return distance, blocks, floats
 
 
 def configuration(robot: Any, q: Numbers) -> Configuration:

@@ -20,7 +20,6 @@ from vprism_plan.collision.explain import nearest_source, unit_ball_points, volu
 from vprism_plan.collision.packing import (
     AT_MOST,
     Configuration,
-    PackedWorld,
     Rows,
     Waypoints,
     pack_robot,
@@ -60,8 +59,8 @@ class Certain:
         return [self._world.certain_field(ids) for ids in self.rules]
 
     @cached_property
-    def packed(self) -> PackedWorld:
-        """The same for the kernels: distances, block bounds, near distances, floats."""
+    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for the kernels: distances, block bounds, floats."""
         return pack_world(self._world, self.fields, 0.0)
 
 
@@ -87,8 +86,8 @@ class Setting:
     margin: float = 0.0  # metres to keep from what is certain; in `radii` already
 
     @cached_property
-    def packed(self) -> PackedWorld:
-        """The same for the kernels, with the margin."""
+    def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same for the kernels, with the margin: distances, block bounds, floats."""
         return wider(self.certain.packed, self.margin)
 
 

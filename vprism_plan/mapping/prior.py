@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
@@ -300,25 +300,6 @@ class PriorField:
             len(centers), 512,
         )  # fmt: skip
         return low, high
-
-    def bulges(
-        self,
-        centers: Float[np.ndarray, "n 3"],
-        half: float,
-        shares: Float32[np.ndarray, "n c"],
-        need: Float[np.ndarray, " n"],
-    ) -> Float[np.ndarray, "n 2"]:
-        """Return how far log-odds in cubes of edge 2 `half` m may lie over, and under, what is
-        linear between a cube's corners since trilinear grids have kinks, if objects have these
-        shares in what is occupied; exact only where it is more than `need`."""
-        out, centers = np.empty((len(centers), 2)), np.ascontiguousarray(centers)
-        run_chunked(
-            lambda s: kernels.guess_bulges(
-                centers, half, *self._grids, shares, need, out, s.start, s.stop
-            ),
-            len(centers), 512,
-        )  # fmt: skip
-        return out
 
 
 def _transformed(pose: Float[np.ndarray, "3 4"], points: Float[Tensor, "n 3"]) -> Tensor:

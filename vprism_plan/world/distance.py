@@ -3,28 +3,21 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int16, Int32, UInt8
+from jaxtyping import Float, Float32, Int16, UInt8
 
 from vprism_plan._kernels import world as kernels
-from vprism_plan._kernels.checking import NEAR_REACH, NEAR_STEPS
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
-from vprism_plan.world.grid import Grid, Index, Nodes, Points, Values, Vector, window
+from vprism_plan.world.grid import Grid, Index, Nodes, Points, Values, Vector
 
 if TYPE_CHECKING:
     import torch
 
 _MAX_LATTICE = 400_000_000
-# Near a surface, blocks of 4 x 4 x 4 cells have nodes four times as close. Farther away than this
-# (grid steps) the grid's own nodes lose less than a sixth of a step.
-_NEAR, _CLOSE = 4, 2.6
-_SIDE = 4 * _NEAR
-NO_NEAR = np.empty((0, *3 * (_SIDE + 1,)), dtype=np.uint8)
-NO_ROWS = np.empty((0, 0, 0), dtype=np.int32)
 
 
 @dataclass(frozen=True)
@@ -38,44 +31,6 @@ class Lattice:
     # position of labels[0, 0, 0] in lattice steps from the world origin
     corner: Index
     factor: int  # lattice steps per grid step
-
-
-@dataclass(frozen=True)
-class Planed:
-    """Obstacles in cells of a lattice that begins at the world origin: what of each cell lies under
-    its plane, n . (x - index) <= c with (n, c) in `planes`; all of it where they are 0."""
-
-    cells: tuple[tuple[Index, int, Float32[np.ndarray, "n 4"]], ...]  # index, size, planes
-    factor: int  # lattice steps per grid step
-
-    def nodes(self, grid: Grid, cells: Nodes) -> Nodes:
-        """Distances (m, rounded down) of a grid's nodes up to `NEAR_REACH`, from there on those to
-        whole cells."""
-        reach = math.ceil(NEAR_REACH * self.factor)
-        square = np.full(grid.shape, reach**2, dtype=np.float32)
-        for index, size, planes in self.cells:
-            far = reach if planes.any() else 0  # nothing is nearest to what lies wholly inside
-            first = grid.first * self.factor
-            kernels.stamp_cells(index, size, planes, first, self.factor, far, square)
-        found = self._metres(square, grid)
-        return np.where(square < reach**2, found, np.maximum(found, cells))
-
-    def near(
-        self, grid: Grid, rows: Int32[np.ndarray, "bx by bz"]
-    ) -> Float32[np.ndarray, "n 17 17 17"]:
-        """The same at the nodes four times as close of blocks that have a row."""
-        reach, step = math.ceil(NEAR_REACH * self.factor), self.factor // _NEAR
-        square = np.full((rows.max() + 1, *3 * (_SIDE + 1,)), reach**2, dtype=np.float32)
-        for index, size, planes in self.cells:
-            far = reach if planes.any() else 0
-            first = grid.first * self.factor
-            kernels.stamp_blocks(index, size, planes, first, step, far, rows, square)
-        return self._metres(square, grid)
-
-    def _metres(self, square: Any, grid: Grid) -> Any:
-        # A thousandth of a step for rounding.
-        steps = np.maximum(np.sqrt(square) - np.float32(1e-3), 0.0)
-        return steps * np.float32(grid.spacing / self.factor)
 
 
 def lattice_nodes(shape: Index, what: str) -> UInt8[np.ndarray, "x y z"]:
@@ -93,29 +48,21 @@ def distance_to_lattice(
 ) -> tuple[Nodes, UInt8[np.ndarray, "nx ny nz"]]:
     """Exact distance (metres, rounded down) from every node to the marked cells, and their label.
     Infinite, with label 0, if nothing is marked."""
-    step = lattice.factor
-    return _transform(lattice.labels, grid.first * step - lattice.corner, step, grid)
-
-
-def _transform(
-    labels: UInt8[np.ndarray, "x y z"], corner: Index, step: int, grid: Grid, size: int = 8
-) -> tuple[Nodes, UInt8[np.ndarray, "nx ny nz"]]:
-    """The same, for nodes every `step` steps from a corner on; threads take `size` rows each."""
-    first = [int(v) for v in corner]
+    first = [int(v) for v in grid.first * lattice.factor - lattice.corner]
     nx, ny, nz = grid.shape
-    X = len(labels)
-    labels = np.ascontiguousarray(labels)
+    X = len(lattice.labels)
+    step = lattice.factor
+    labels = np.ascontiguousarray(lattice.labels)
     d_y, l_y = np.empty((X, ny, nz), np.int32), np.empty((X, ny, nz), np.uint8)
     run_chunked(
-        lambda s: kernels.edt_layers(labels, *first[1:], step, d_y, l_y, s.start, s.stop),
-        X, 2 * size,
-    )  # fmt: skip
+        lambda s: kernels.edt_layers(labels, *first[1:], step, d_y, l_y, s.start, s.stop), X, 16
+    )
     distance, nearest = np.empty((nx, ny, nz), np.float32), np.empty((nx, ny, nz), np.uint8)
     run_chunked(
         lambda s: kernels.edt_pass_x(
             d_y, l_y, first[0], step, grid.spacing / step, distance, nearest, s.start, s.stop
         ),
-        ny, size,
+        ny, 8,
     )  # fmt: skip
     return distance, nearest
 
@@ -146,9 +93,6 @@ class DistanceField:
         solid_outside: whether space outside the grid is an obstacle.
         beyond: a coarser field of the obstacles outside the grid's box, whose bounds the nodes here
             already hold; None if there are none.
-        near: (n, 17, 17, 17) lower bounds in hundredths of `spacing` at nodes four times as close,
-            in those blocks of 4 x 4 x 4 cells that are near a surface; 0 also inside.
-        rows: (bx, by, bz) which of `near` each block has, -1 for none.
     """
 
     origin: Vector
@@ -158,8 +102,6 @@ class DistanceField:
     sources: tuple[str, ...]
     solid_outside: bool = False
     beyond: "DistanceField | None" = None
-    near: UInt8[np.ndarray, "n 17 17 17"] = field(default_factory=lambda: NO_NEAR, repr=False)
-    rows: Int32[np.ndarray, "bx by bz"] = field(default_factory=lambda: NO_ROWS, repr=False)
     _tensors: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -176,25 +118,12 @@ class DistanceField:
         d(x) >= max_i d_i - |x - x_i|. WorldError if a point is not finite.
         """
         points = checked_points(points)
-        out = lower_bounds(points, self, self.distance, self.solid_outside, self.rows, self.near)
+        out = lower_bounds(points, self, self.distance, self.solid_outside)
         if self.beyond is not None:
             outside = ((points < self.origin) | (points > self.upper)).any(axis=1)
             if outside.any():
                 out[outside] = np.minimum(out[outside], self.beyond.lower_bound(points[outside]))
         return out
-
-    def within(self, other: "DistanceField") -> "DistanceField":
-        """Return bounds for what is an obstacle of this field and of another one on its grid."""
-        near, rows = [self.near, other.near], self.rows.copy()
-        both = (rows >= 0) & (other.rows >= 0)
-        near[0] = self.near.copy()
-        near[0][rows[both]] = np.maximum(self.near[rows[both]], other.near[other.rows[both]])
-        alone = (rows < 0) & (other.rows >= 0)
-        rows[alone] = len(self.near) + other.rows[alone]
-        return replace(
-            self, distance=np.maximum(self.distance, other.distance), rows=rows,
-            near=np.concatenate(near), _tensors={},
-        )  # fmt: skip
 
     def source_at(self, points: Points) -> Int16[np.ndarray, " n"]:
         """Index into `sources` of the obstacle nearest to the grid node nearest to each point;
@@ -244,21 +173,14 @@ class DistanceField:
         return self._tensors[key]
 
 
-def lower_bounds(
-    points: Points,
-    grid: Any,
-    distance: Nodes,
-    solid_outside: bool = False,
-    rows: np.ndarray = NO_ROWS,
-    near: np.ndarray = NO_NEAR,
-) -> Values:
+def lower_bounds(points: Points, grid: Any, distance: Nodes, solid_outside: bool = False) -> Values:
     """`DistanceField.lower_bound` for distances at the nodes of a grid, nothing beyond it."""
     out = np.empty(len(points))
 
     def look(piece: slice) -> None:
         kernels.lower_bounds(
-            points, grid.origin, grid.spacing, distance, rows, near,
-            grid.spacing / NEAR_STEPS, solid_outside, out, piece.start, piece.stop,
+            points, grid.origin, grid.spacing, distance, solid_outside, out,
+            piece.start, piece.stop,
         )  # fmt: skip
 
     run_chunked(look, len(points), 1 << 14)
@@ -283,8 +205,6 @@ class NodeDistances:
 
     distance: Nodes
     source: Int16[np.ndarray, "nx ny nz"]
-    # what the distances are those to; none: nothing is known but they
-    exact: tuple[Any, ...] = ()
 
 
 def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
@@ -295,8 +215,7 @@ def combine(parts: Sequence[NodeDistances], grid: Grid) -> NodeDistances:
         closer = part.distance < distance
         np.copyto(distance, part.distance, where=closer)
         np.copyto(source, part.source, where=closer)
-    exact = [e for part in parts for e in part.exact or (part.distance,)]
-    return NodeDistances(distance, source, tuple(exact))
+    return NodeDistances(distance, source)
 
 
 def at_nodes(grid: Grid, bound: Callable[[np.ndarray], np.ndarray]) -> Nodes:
@@ -347,11 +266,9 @@ def finish(
     sources: tuple[str, ...],
     solid_outside: bool,
     beyond: DistanceField | None = None,
-    near: bool = False,
 ) -> DistanceField:
     """Give nodes inside obstacles their depth and make the field: a node at distance 0 is at
-    most as far from open space as from the nearest node with a positive distance. With `near`,
-    millimetres near surfaces are added, as far as the obstacles are known exactly."""
+    most as far from open space as from the nearest node with a positive distance."""
     distance = nodes.distance.copy()
     inside = distance <= 0.0
     reach = float(np.linalg.norm(grid.upper - grid.origin)) + grid.spacing
@@ -367,85 +284,10 @@ def finish(
         distance[box] = np.where(inside[box], -depth, distance[box])
     # Nothing anywhere: any finite number is a bound, and arithmetic stays finite.
     distance[np.isinf(distance)] = reach
-    rows, close = _near_blocks(distance, nodes.exact, grid) if near else (NO_ROWS, NO_NEAR)
     return DistanceField(
         grid.origin, grid.spacing, np.ascontiguousarray(distance), nodes.source, sources,
-        solid_outside, beyond, close, rows,
+        solid_outside, beyond,
     )  # fmt: skip
-
-
-def lowest_in_blocks(values: Float[np.ndarray, "nx ny nz"]) -> Float[np.ndarray, "bx by bz"]:
-    """Return the least value at the nodes of each block of 4 x 4 x 4 cells."""
-    for axis, n in enumerate(values.shape):
-        rows = np.minimum(4 * np.arange((n - 1) // 4 + 1)[:, None] + np.arange(5), n - 1)
-        values = np.take(values, rows, axis=axis).min(axis=axis + 1)
-    return values
-
-
-def _near_blocks(
-    distance: Nodes, exact: Sequence[Any], grid: Grid
-) -> tuple[Int32[np.ndarray, "bx by bz"], UInt8[np.ndarray, "n 17 17 17"]]:
-    """`DistanceField.rows` and `near`: distances to all of `exact`, of which each is a `Lattice`,
-    or has a `signed_distance` of points, or is a bound at the nodes of the grid."""
-    chosen = lowest_in_blocks(distance) < _CLOSE * grid.spacing
-    chosen &= lowest_in_blocks(-distance) < 0.0
-    rows = np.full(chosen.shape, -1, dtype=np.int32)
-    rows[chosen] = np.arange(chosen.sum())
-    blocks = np.argwhere(chosen)
-    nearest = np.full((len(blocks), *NO_NEAR.shape[1:]), np.inf, dtype=np.float32)
-    planed = [part for part in exact if isinstance(part, Planed)]
-    for part in planed if len(blocks) else ():
-        np.minimum(nearest, part.near(grid, rows), out=nearest)
-    # Without threads: these steps are so short that they would wait for each other.
-    for i, block in enumerate(blocks):
-        first = _NEAR * grid.first + _SIDE * block
-        box = Grid(grid.spacing / _NEAR, first, (_SIDE + 1,) * 3)
-        for part in exact:
-            found = None if isinstance(part, Planed) else _near_distance(part, box, grid, 4 * block)
-            if found is not None:
-                np.minimum(nearest[i], found, out=nearest[i])
-    # A thousandth of a step for the rounding of this.
-    steps = np.floor(nearest * (NEAR_STEPS / grid.spacing) - 1e-3)
-    return rows, np.clip(steps, 0.0, 255.0).astype(np.uint8)
-
-
-def _near_distance(
-    part: Any, box: Grid, grid: Grid, node: Index
-) -> Float[np.ndarray, "17 17 17"] | None:
-    """Bounds of the distance to a part at the nodes of a block that begins at a node of the grid;
-    None if it is nowhere near."""
-    reach = NEAR_REACH * grid.spacing
-    if isinstance(part, np.ndarray):
-        around = part[window(node, node + 5)]
-        if around.min() > reach + grid.spacing:
-            return None
-        return lower_bounds(box.slab(0, _SIDE + 1), grid, part).reshape(box.shape)
-    if not isinstance(part, Lattice):
-        middle = 0.5 * (box.origin + box.upper)
-        if part.signed_distance(middle[None])[0] > reach + np.linalg.norm(middle - box.origin):
-            return None
-        return np.asarray(part.signed_distance(box.slab(0, _SIDE + 1))).reshape(box.shape)
-    step, room = part.factor, math.ceil(NEAR_REACH * part.factor) + 1
-    first = box.first // _NEAR * step - part.corner
-    low = np.maximum(first - room, 0)
-    high = np.minimum(first + 4 * step + room + 1, part.labels.shape)
-    labels = part.labels[window(low, np.maximum(high, low))]
-    if not labels.any():
-        return None
-    while step < _NEAR:
-        labels, low, step = _halved(labels), 2 * low, 2 * step
-        first = 2 * first
-    return _transform(labels, first - low, step // _NEAR, box, labels.size)[0]
-
-
-def _halved(labels: UInt8[np.ndarray, "x y z"]) -> UInt8[np.ndarray, "a b c"]:
-    """Marks of the same cells at nodes half as far apart."""
-    for axis in range(3):
-        lines = np.moveaxis(labels, axis, 0)
-        fine = np.zeros((2 * len(lines) - 1, *lines.shape[1:]), dtype=np.uint8)
-        fine[::2], fine[1::2] = lines, np.minimum(lines[:-1], lines[1:])
-        labels = np.moveaxis(fine, 0, axis)
-    return labels
 
 
 def bounding(mask: np.ndarray, margin: int) -> tuple[slice, ...]:

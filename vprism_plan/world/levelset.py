@@ -7,36 +7,41 @@ of edge h the log-odds g differ from the trilinear interpolation of their corner
 h^2/8 max|g_aa|; the second derivatives come from the 27 points that dividing the parent evaluates
 anyway. They are finite differences of a smooth function, counted twice: not a proof for an
 arbitrary one. A guess of the map's prior is not smooth: in a cell it counts as its largest, or
-least, value there, until cells resolve it; then its voxels say how far it lies over a plane. The
-smallest cells have planes as well, which the level set does not cross in them.
+least, value there, until cells resolve it.
 """
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from vprism_plan._kernels import world as kernels
 from vprism_plan._threads import run_chunked
 from vprism_plan.errors import WorldError
-from vprism_plan.world.distance import Lattice, Planed, lattice_nodes
+from vprism_plan.world.distance import Lattice, lattice_nodes
 from vprism_plan.world.grid import Chosen, Index, Points, Values
 
 # How far the second derivatives may exceed their finite-difference estimate.
 _CURVATURE_SAFETY = 2.0
+# Of a guess, whose slope changes by s at a voxel's face: half way between nodes at a distance h
+# it lies off a parabola by 3 s h / 16; the second difference is s h / 2.
+_KINKS = 12.0
 _RESOLVED = 0.9  # distance of nodes, in voxels of a guess, that steps over none of them
 # Log-odds: covers the jump where a kernel is cut off, and rounding.
 _SLACK = 1e-3
 _CHUNK = 1 << 16
-# Cells of a surface, a kilobyte each: about 0.8 square metres at a resolution of 1 mm.
+# Cells of a surface, a kilobyte each: about 3 square metres at a resolution of 1 mm.
 _MOST_CELLS = 8_000_000
-_LAST = 1  # edge of the smallest cells, lattice steps
 
 _OFFSETS = np.indices((3, 3, 3)).reshape(3, 27).T
 _CHILDREN = np.indices((2, 2, 2)).reshape(3, 8).T
+# Values of the parabola through three nodes at the nodes and half way between them.
+_HALVES = np.array(
+    [[1, 0, 0], [0.375, 0.75, -0.125], [0, 1, 0], [-0.125, 0.75, 0.375], [0, 0, 1]], dtype=float
+)
 
 
 @dataclass(frozen=True)
@@ -50,15 +55,10 @@ class Cells:
     label: UInt8[np.ndarray, " n"]
     # the same at each corner of that cell, 0 where it is not occupied
     around: UInt8[np.ndarray, "n 8"]
-    # (nx, ny, nz, c): in the cell of twice the edge that it is a child of, with its lowest corner
-    # at x0, the level set lies in n . (x - x0) <= c, in the same units; 0 if unknown
-    plane: Float32[np.ndarray, "n 4"]
 
     def select(self, chosen: Chosen) -> "Cells":
         """Return only the chosen cells."""
-        columns = (self.index, self.label, self.around, self.plane)
-        index, label, around, plane = (column[chosen] for column in columns)
-        return Cells(index, self.size, label, around, plane)
+        return Cells(self.index[chosen], self.size, self.label[chosen], self.around[chosen])
 
 
 @dataclass(frozen=True)
@@ -70,22 +70,6 @@ class LevelSet:
     # may be reached
     cells: tuple[Cells, ...]
     evaluations: int  # how many points of the map were evaluated
-
-    def of(self, classes: Collection[int] | None) -> "LevelSet":
-        """Return only, and the whole of, cells in which one of these classes is the most probable
-        at some corner; all if None."""
-        if classes is None:
-            return self
-        return replace(self, cells=tuple(_owned(part, classes) for part in self.cells))
-
-    def planed(self, factor: int) -> Planed:
-        """Return what distances near it are measured to."""
-        parts = [(part.index, part.size, part.plane) for part in self.cells[:-1]]
-        for last in self.cells[-1:]:
-            size = 2 * last.size
-            parents, first, _ = _distinct(last.index // size)
-            parts.append((parents * size, size, last.plane[first]))
-        return Planed(tuple(parts), factor)
 
     def box(self) -> tuple[Index, Index] | None:
         """First and last lattice node of the cover, or None if it is empty."""
@@ -103,32 +87,30 @@ def log_odds(probabilities: Float[np.ndarray, "n k"]) -> Values:
     return np.log(np.clip(probabilities[:, 1:].sum(axis=1), 1e-18, None)) - np.log(empty)
 
 
-def _evaluate(map_: Any, points: Points, level: float) -> tuple[Values, Float32[np.ndarray, "n c"]]:
-    """Log-odds less those of the level, and what share each object has in P(occupied), at
-    points."""
+def _evaluate(map_: Any, points: Points, level: float) -> tuple[Values, UInt8[np.ndarray, " n"]]:
+    """Log-odds less those of the level, and the most probable object class, at points."""
     values = np.empty(len(points))
-    shares = np.empty((len(points), len(map_.object_ids)), dtype=np.float32)
+    labels = np.empty(len(points), dtype=np.uint8)
     for start in range(0, len(points), _CHUNK):
         piece = slice(start, start + _CHUNK)
         probabilities = np.asarray(map_.predict_proba(points[piece]))
         values[piece] = log_odds(probabilities)
-        occupied = np.maximum(probabilities[:, 1:].sum(axis=1, keepdims=True), 1e-300)
-        shares[piece] = probabilities[:, 1:] / occupied
+        labels[piece] = 1 + np.argmax(probabilities[:, 1:], axis=1)
     if not np.isfinite(values).all():
         raise WorldError("the map's probabilities are not finite; refit or reload the map")
-    return values - math.log(level / (1.0 - level)), shares
+    return values - math.log(level / (1.0 - level)), labels
 
 
-def _distinct(nodes: Int[np.ndarray, "n 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distinct lattice nodes (m, 3), the first row of each, and where each given one is among
-    them."""
-    low = nodes.min(axis=0, initial=2**31)
-    extent = nodes.max(axis=0, initial=-(2**31)) - low + 1
-    keys = nodes[:, 0]
-    if len(nodes):
-        keys = np.ravel_multi_index(tuple((nodes - low).T), tuple(extent))
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    return nodes[first], first, inverse
+def _unique_nodes(
+    nodes: Int[np.ndarray, "n 27 3"],
+) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, "n 27"]]:
+    """Distinct lattice nodes, and where each given one is among them."""
+    low = nodes.reshape(-1, 3).min(axis=0)
+    extent = nodes.reshape(-1, 3).max(axis=0) - low + 1
+    keys = np.ravel_multi_index(tuple(np.moveaxis(nodes - low, -1, 0)), tuple(extent))
+    unique, inverse = np.unique(keys.reshape(-1), return_inverse=True)
+    found = np.stack(np.unravel_index(unique, tuple(extent)), axis=1)
+    return found + low, inverse.reshape(keys.shape)
 
 
 def _curvature(g: Float[np.ndarray, "n 3 3 3"]) -> Values:
@@ -182,27 +164,24 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
     evaluations = 0
     while True:
         # Once cells resolve a surface, halves of them are four times as many.
-        expected = len(index) * (size // 2) ** 2
+        expected = len(index) * (size // 4) ** 2
         if size * spacing < 0.25 * detail and expected > _MOST_CELLS:
             raise WorldError(
                 f"the surfaces at level {level:g} would take {expected:,} cells of "
-                f"{2 * spacing:g} m (at most {_MOST_CELLS:,}); use a coarser resolution"
+                f"{4 * spacing:g} m (at most {_MOST_CELLS:,}); use a coarser resolution"
             )
         size //= 2
-        nodes, _, where = _distinct((index[:, None, :] + _OFFSETS * size).reshape(-1, 3))
-        where = where.reshape(-1, 27)
-        values, shares = _evaluate(map_, nodes * spacing, level)
+        nodes, where = _unique_nodes(index[:, None, :] + _OFFSETS * size)
+        values, labels = _evaluate(map_, nodes * spacing, level)
         evaluations += len(nodes)
         g = values[where].reshape(-1, 3, 3, 3)
-        owners = (1 + shares.argmax(axis=1)).astype(np.uint8)[where].reshape(-1, 3, 3, 3)
+        owners = labels[where].reshape(-1, 3, 3, 3)
         step = spacing * size / map_.kernel_length
-        guess = None
-        if prior is not None and size * spacing > _RESOLVED * detail:
-            guess = prior.at(nodes * spacing)
-        bounds = _Bounds(prior, spacing, g.reshape(-1, 27), where, guess, shares)
-        if size == _LAST:
-            smallest = _border(index, size, g, owners, bounds, step)
-            return LevelSet(spacing, (*inner, *smallest), evaluations)
+        if size == 2:
+            safety = _CURVATURE_SAFETY if prior is None else _KINKS
+            return LevelSet(spacing, (*inner, _border(index, g, owners, step, safety)), evaluations)
+        guess = None if prior is None else prior.at(nodes * spacing)
+        bounds = _Bounds(prior, spacing, g.reshape(-1, 27), where, guess)
         inside, border = _divide(index, size, g, owners, bounds, step)
         inner.append(inside)
         index = border.index
@@ -212,38 +191,23 @@ def trace_level_set(map_: Any, spacing: float, level: float) -> LevelSet:
 
 @dataclass(frozen=True)
 class _Bounds:
-    """Log-odds (n, 27) of cells at their nodes, and `where` these are among those with a guess
-    (none once nodes resolve it) and shares of the objects."""
+    """Log-odds (n, 27) of cells at their nodes, and `where` these are among those with a guess."""
 
     prior: Any
     spacing: float
     g: Float[np.ndarray, "n 27"]
     where: Int[np.ndarray, "n 27"]
     guess: Float[np.ndarray, "m k"] | None
-    shares: Float32[np.ndarray, "m c"]
-
-    def slack(self, step: float) -> Values:
-        """By how much log-odds may exceed those at the nodes, but for the guess's kinks."""
-        # Second differences are the kinks' as well: enough for a part that is smooth.
-        known = self.prior is not None and self.guess is None
-        return _slack(self.g.reshape(-1, 3, 3, 3), step, 1.0 if known else _CURVATURE_SAFETY)
 
     def over(
-        self, rows: Any, nodes: Any, middle: Float[np.ndarray, "r 3"], half: float, slack: Any = 0.0
+        self, rows: Any, nodes: Any, middle: Float[np.ndarray, "r 3"], half: float
     ) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
         """Return log-odds at some nodes of some cells, as if the guess were what it is at the
-        least, and at the most, in cubes of edge 2 `half` lattice steps; once nodes resolve it,
-        less and more its kinks, if these matter beside some slack."""
+        least, and at the most, in cubes of edge 2 `half` lattice steps."""
         g, where = self.g[rows][:, nodes], self.where[rows][:, nodes]
-        if self.prior is None:
-            return g, g
-        cubes = self.spacing * middle, self.spacing * half
         if self.guess is None:
-            shares = np.max([self.shares[column] for column in where.T], axis=0)
-            need = np.maximum(-g.max(axis=1), g.min(axis=1)) - slack
-            over, under = self.prior.bulges(*cubes, shares, need).T[..., None]
-            return g - under, g + over
-        low, high = self.prior.bounds(*cubes)
+            return g, g
+        low, high = self.prior.bounds(self.spacing * middle, self.spacing * half)
         least, most = g.copy(), g.copy()
         run_chunked(
             lambda s: kernels.widen(self.guess, where, low, high, least, most, s.start, s.stop),
@@ -262,22 +226,19 @@ def _divide(
 ) -> tuple[Cells, Cells]:
     """Sort the children (edge `size`, `step` kernel lengths) into inside and to divide: also
     those with more than one object at their corners."""
-    slack = bounds.slack(step)
-    least, most = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, slack)
-    below = above = slack
-    if bounds.guess is not None:
-        below, above = (_slack(part.reshape(g.shape), step) for part in (least, most))
+    least, most = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size)
+    below, above = (_slack(part.reshape(g.shape), step) for part in (least, most))
     inside, border = [], []
     for child in _CHILDREN:
         nodes = (child + _CHILDREN) @ [9, 3, 1]
         rows = np.flatnonzero(most[:, nodes].max(axis=1) >= -above)
         corner = index[rows] + child * size
-        low, high = bounds.over(rows, nodes, corner + 0.5 * size, 0.5 * size, above[rows])
+        low, high = bounds.over(rows, nodes, corner + 0.5 * size, 0.5 * size)
         chosen = high.max(axis=1) >= -above[rows]
         rows = rows[chosen]
         values, owner = (part.reshape(-1, 27)[rows][:, nodes] for part in (g, owners))
         label, around = _ownership(values, high[chosen], owner, above[rows])
-        cells = Cells(corner[chosen], size, label, around, np.zeros((len(label), 4), np.float32))
+        cells = Cells(corner[chosen], size, label, around)
         whole = low[chosen].min(axis=1) >= below[rows]
         whole &= (around == around[:, :1]).all(axis=1)
         inside.append(cells.select(whole))
@@ -285,13 +246,11 @@ def _divide(
     return _join(inside), _join(border)
 
 
-def _slack(
-    g: Float[np.ndarray, "n 3 3 3"], step: float, safety: float = _CURVATURE_SAFETY
-) -> Values:
+def _slack(g: Float[np.ndarray, "n 3 3 3"], step: float) -> Values:
     """By how much log-odds in a cell may exceed those at the corners of its eighths."""
     # Second derivatives of a kernel of length l change by up to 3 |g'| / l^2 per metre.
     spread = np.ptp(g, axis=(1, 2, 3))
-    return safety * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
+    return _CURVATURE_SAFETY * _curvature(g) / 8.0 + 0.25 * step**2 * spread + _SLACK
 
 
 def _ownership(
@@ -311,64 +270,52 @@ def _ownership(
 
 def _border(
     index: Int[np.ndarray, "n 3"],
-    size: int,
     g: Float[np.ndarray, "n 3 3 3"],
     owners: UInt8[np.ndarray, "n 3 3 3"],
-    bounds: _Bounds,
     step: float,
-) -> tuple[Cells, Cells]:
-    """Sort the children (edge `size`) into those inside and those to keep, each with a plane that
-    the level set does not cross in it: by what log-odds differ from linear at its corners."""
-    slack = bounds.slack(step)
-    ends = ((g.take(2, axis) - g.take(0, axis)) / (2.0 * size) for axis in (1, 2, 3))
-    normals = np.stack([-part.mean(axis=(1, 2)) for part in ends], axis=1)
-    rough = bounds.over(slice(None), slice(None), index + 1.0 * size, 1.0 * size, slack)[1]
-    inside, kept = [], []
-    for child in _CHILDREN:
-        nodes = (child + _CHILDREN) @ [9, 3, 1]
-        rows = np.flatnonzero(rough[:, nodes].max(axis=1) >= -slack)
-        corner = index[rows] + child * size
-        middle, half = corner + 0.5 * size, 0.5 * size
-        least, most = bounds.over(rows, nodes, middle, half, slack[rows])
-        least, most = least - slack[rows, None], most + slack[rows, None]
-        chosen = most.max(axis=1) >= 0.0
-        rows, corner, least, most = rows[chosen], corner[chosen], least[chosen], most[chosen]
-        values, owner = (part.reshape(-1, 27)[rows][:, nodes] for part in (g, owners))
-        label, around = _ownership(values, most, owner, np.zeros(len(most)))
-        normal = normals[rows]
-        steep = np.linalg.norm(normal, axis=1)
-        farthest = (most + normal @ (size * (child + _CHILDREN).T)).max(axis=1)
-        plane = np.column_stack([normal, farthest]) / np.maximum(steep, 1e-9)[:, None]
-        plane[steep < 1e-3] = 0.0  # as good as constant
-        whole = (least.min(axis=1) >= 0.0) & (around == around[:, :1]).all(axis=1)
-        plane[whole] = 0.0
-        cells = Cells(corner, size, label, around, plane.astype(np.float32))
-        inside.append(cells.select(whole))
-        kept.append(cells.select(~whole))
-    border = _join(kept)
-    # The children of a cell have one normal: one plane holds for all of them.
-    _, first, where = _distinct(border.index // (2 * size))
-    farthest = np.full(len(first), -np.inf, dtype=np.float32)
-    np.maximum.at(farthest, where, border.plane[:, 3])
-    border.plane[:, 3] = farthest[where]
-    return _join(inside), border
+    safety: float,
+) -> Cells:
+    """Divide cells of edge 4, known at every second node, into those of edge 1 that count. The map
+    is not evaluated again: a parabola through three nodes at a distance h is off by at most h^3 /
+    (9 sqrt 3) |g_aaa| per axis, and |g_aaa| is about 3 |g_a| / l^2."""
+    fine = np.einsum("ai,bj,ck,nijk->nabc", _HALVES, _HALVES, _HALVES, g, optimize=True)
+    # Second differences at half the spacing are a quarter of those in `g`.
+    spread = np.ptp(g, axis=(1, 2, 3))
+    slack = safety * _curvature(g) / 32.0 + 0.3 * step**2 * spread + _SLACK
+    kept = []
+    for child in np.ndindex(4, 4, 4):
+        corners = fine[(slice(None), *(slice(c, c + 2) for c in child))].reshape(len(g), 8)
+        chosen = corners.max(axis=1) >= -slack
+        block = (chosen, *(slice(c // 2, c // 2 + 2) for c in child))
+        evaluated, owner = g[block].reshape(-1, 8), owners[block].reshape(-1, 8)
+        label, around = _ownership(evaluated, evaluated, owner, slack[chosen])
+        kept.append(Cells(index[chosen] + np.array(child), 1, label, around))
+    return _join(kept)
 
 
 def _join(parts: list[Cells]) -> Cells:
-    columns = zip(*((p.index, p.label, p.around, p.plane) for p in parts), strict=True)
-    index, label, around, plane = (np.concatenate(column) for column in columns)
-    return Cells(index, parts[0].size, label, around, plane)
+    columns = zip(*((part.index, part.label, part.around) for part in parts), strict=True)
+    index, label, around = (np.concatenate(column) for column in columns)
+    return Cells(index, parts[0].size, label, around)
 
 
-def rasterize_level_set(level_set: LevelSet, factor: int) -> Lattice | None:
-    """Mark the corners of the cells of a level set with the object class found there; None if there
-    is no cell."""
-    box = level_set.box()
+def rasterize_level_set(
+    level_set: LevelSet, factor: int, classes: Collection[int] | None = None
+) -> Lattice | None:
+    """Mark the corners of the cells of a level set with the object class found there.
+
+    With `classes`, only, and the whole of, cells in which one of these is the most probable at some
+    corner. None if there is no cell.
+    """
+    cells = level_set.cells
+    if classes is not None:
+        cells = tuple(_owned(part, classes) for part in cells)
+    box = LevelSet(level_set.spacing, cells, 0).box()
     if box is None:
         return None
     lower, upper = box
     labels = lattice_nodes(upper - lower + 1, "the level set")
-    for part in level_set.cells:
+    for part in cells:
         kernels.fill_blocks(labels, part.index - lower, part.label, part.size)
     return Lattice(labels, lower, factor)
 
@@ -377,4 +324,4 @@ def _owned(cells: Cells, classes: Collection[int]) -> Cells:
     """Cells with one of the classes at some corner around them, relabelled with it."""
     mine = np.isin(cells.around, np.array(sorted(classes), dtype=cells.around.dtype))
     label = np.where(mine, cells.around, 0).max(axis=1, initial=0)
-    return replace(cells, label=label).select(label > 0)
+    return Cells(cells.index, cells.size, label, cells.around).select(label > 0)

@@ -186,7 +186,7 @@ class World:
 
     def _marked_distances(self, marks: Lattice, grid: Grid) -> NodeDistances:
         distance, label = distance_to_lattice(marks, grid)
-        return NodeDistances(distance, self._sources_of_marks()[label], (marks,))
+        return NodeDistances(distance, self._sources_of_marks()[label])
 
     def _sources_of_marks(self) -> np.ndarray:
         """Index into `sources` of each mark of `world.marks`, -1 for none, (256,)."""
@@ -244,7 +244,7 @@ class World:
         if solid is None:
             return []
         distance = at_nodes(grid, lambda points: solid.signed_distance(points) - 1e-9)
-        return [NodeDistances(distance, self._all_of(name, grid), (solid,))]
+        return [NodeDistances(distance, self._all_of(name, grid))]
 
     def _all_of(self, name: str, grid: Grid) -> np.ndarray:
         return np.full(grid.shape, self.sources.index(name), dtype=np.int16)
@@ -258,23 +258,19 @@ class World:
 
     def _object_distances(self, classes: Collection[int] | None) -> NodeDistances:
         """Distance to the level set (of some classes only); class k is source k - 1."""
-        cells = self._level_set.of(classes)
-        lattice = rasterize_level_set(cells, self._factor)
+        lattice = rasterize_level_set(self._level_set, self._factor, classes)
         if lattice is None:
             return combine([], self.grid)
         distance, label = distance_to_lattice(lattice, self.grid)
-        planed = cells.planed(self._factor)
-        distance = planed.nodes(self.grid, distance)
-        return NodeDistances(distance, label.astype(np.int16) - np.int16(1), (planed,))
+        return NodeDistances(distance, label.astype(np.int16) - np.int16(1))
 
     def _known_distances(self, solids: list[Any]) -> list[NodeDistances]:
         parts = []
         for item in solids:
             name = f"known:{item.name}"
             if isinstance(item, KnownMesh):
-                lattice = rasterize_mesh(item, self.grid)
-                distance, _ = distance_to_lattice(lattice, self.grid)
-                parts.append(NodeDistances(distance, self._all_of(name, self.grid), (lattice,)))
+                distance, _ = distance_to_lattice(rasterize_mesh(item, self.grid), self.grid)
+                parts.append(NodeDistances(distance, self._all_of(name, self.grid)))
             else:
                 parts += self._solid_distances(item, name, self.grid)
         return parts
@@ -285,7 +281,7 @@ class World:
             beyond, inside = self._around(unmark(self._marks_beyond, without), True)
         nodes = combine([*parts, *inside], self.grid)
         outside = self.config.unobserved == "occupied"
-        return finish(nodes, self.grid, self.sources, outside, beyond, near=True)
+        return finish(nodes, self.grid, self.sources, outside, beyond)
 
     def object_field(self, object_id: int) -> DistanceField:
         """Distance to one object alone: where P(occupied) >= level and it is the likeliest, to
@@ -294,7 +290,7 @@ class World:
         key = ("only", frozenset([k]))
         if key not in self._cache:
             nodes = self._object_distances([k])
-            self._cache[key] = finish(nodes, self.grid, self.sources, False, near=True)
+            self._cache[key] = finish(nodes, self.grid, self.sources, solid_outside=False)
         return self._cache[key]
 
     def fields_without(self, object_ids: Collection[int]) -> DistanceField:
@@ -326,10 +322,7 @@ class World:
             if seen or gone:
                 marks = self._without(self._all_seen if seen else self._unseen, gone)
                 others = self._unseen_distances(marks)
-            field = self._field([*others, self._known], gone)
-            # Cells of what was seen reach out of the level set: no more of them is an obstacle than
-            # of it, or a higher bound on risk would refuse what a lower one does not.
-            self._cache[key] = field.within(self.fields_without(gone)) if seen else field
+            self._cache[key] = self._field([*others, self._known], gone)
         return self._cache[key]
 
     @cached_property
@@ -380,13 +373,12 @@ class World:
                 parts += inside
             solid_outside = name == "unobserved" and self.config.unobserved == "occupied"
         nodes = combine(parts, self.grid)
-        distance, exact = nodes.distance, nodes.exact
+        distance = nodes.distance
         if solid_outside:  # the world's own distances stop at the faces of the grid
-            faces = self._faces(self.grid).distance
-            distance, exact = np.minimum(distance, faces), (*exact, faces)
+            distance = np.minimum(distance, self._faces(self.grid).distance)
         named = np.where(np.isfinite(distance), np.int16(index), np.int16(-1))
-        nodes = NodeDistances(distance, named, exact)
-        return finish(nodes, self.grid, self.sources, solid_outside, beyond, near=True)
+        nodes = NodeDistances(distance, named)
+        return finish(nodes, self.grid, self.sources, solid_outside, beyond)
 
     def posterior_worlds(
         self,
@@ -411,7 +403,7 @@ class World:
     def _without(self, marks: Lattice, classes: Collection[int]) -> Lattice:
         if not classes:
             return marks
-        inside = rasterize_level_set(self._level_set.of(classes), self._factor)
+        inside = rasterize_level_set(self._level_set, self._factor, classes)
         return unmark(marks, classes, inside)
 
     def _rest(self, gone: Collection[int]) -> set[int]:
