@@ -34,7 +34,7 @@ def looked_through(view, point):
     row, column, z = at
     for v in range(max(0, row - AROUND), min(view.shape[0], row + AROUND + 1)):
         for u in range(max(0, column - AROUND), min(view.shape[1], column + AROUND + 1)):
-            if not view.depth[v, u] > z + MARGIN + 3.0 * float(depth_sigma(np.array(z))):
+            if not view.depth[v, u] > z + MARGIN + 3.0 * depth_sigma(np.array([z]))[0]:
                 return False
     return True
 
