@@ -257,3 +257,20 @@ def test_plane_is_normalised_or_refused():
     ):
         with pytest.raises(ObservationError, match="plane normal"):
             Plane(normal, offset)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "said"),
+    [
+        ((1, 1), 0.51, "beyond the depth seen there"),  # behind the surface that the pixel shows
+        ((0, 0), np.inf, "infinity"),  # no surface was seen there
+        ((1, 1), -0.1, "< 0"),
+        ((1, 1), np.nan, "NaN"),
+    ],
+)
+def test_no_ray_is_free_beyond_its_surface(at, value, said):
+    seen = with_value(depth(0.5), (0, 0), 0.0)
+    clear = with_value(seen, (0, 0), 2.0)
+    np.testing.assert_array_equal(Observation(seen, None, K, clear=clear).free_depth, clear)
+    with pytest.raises(ObservationError, match=said):
+        Observation(seen, None, K, clear=with_value(clear, at, value))

@@ -95,7 +95,7 @@ class Observation:
         if self.time is not None:
             checked["time"] = number("time", self.time, unit="seconds", error=ObservationError)
         if self.clear is not None:
-            checked["clear"] = check_clear(self.clear, depth.shape)
+            checked["clear"] = check_clear(self.clear, depth)
         checked["warnings"] = tuple(dict.fromkeys([*map(str, self.warnings), *found]))
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -340,12 +340,18 @@ def check_pose(value: Any) -> Float[np.ndarray, "4 4"]:
     return pose
 
 
-def check_clear(value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a (H, W) float image of the depth's shape, metres."""
+def check_clear(value: Any, depth: np.ndarray) -> np.ndarray:
+    """Return a (H, W) float image, metres: nowhere beyond the depth (H, W) that was seen."""
     clear = to_numpy(value, "clear")
-    if clear.shape != shape or clear.dtype.kind != "f" or not (clear >= 0.0).all():
+    if clear.shape != depth.shape or clear.dtype.kind != "f" or not (clear >= 0.0).all():
         found = f"clear has shape {clear.shape} and type {clear.dtype}, or holds NaN or what is < 0"
-        raise ObservationError(f"{found}; it must be metres, {shape}")
+        raise ObservationError(f"{found}; it must be metres, {depth.shape}")
+    beyond = int((~np.isfinite(clear) | ((depth > 0.0) & (clear > depth))).sum())
+    if beyond:
+        raise ObservationError(
+            f"clear reaches beyond the depth seen there, or to infinity, in {beyond} pixels; a ray "
+            "is free up to its surface at most"
+        )
     return np.ascontiguousarray(clear)
 
 
